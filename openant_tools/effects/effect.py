@@ -323,37 +323,6 @@ class Effect:
             out.append({first.name: sign * size[first.name], **rest})
         return out
 
-    def draw(self, rng: np.random.Generator, strength: float) -> dict[str, float]:
-        """Coordinates of a random size.
-
-        Args:
-            strength: 0 just beyond tolerance … 1 clearly ill.
-        """
-        sizes = [q for q in self.quantities if not q.shape]
-        # Of a vector often only some parts are there: one signal of several is late, a board turned about one axis.
-        direction = rng.normal(size=len(sizes)) * _some(rng, len(sizes))
-        direction /= np.linalg.norm(direction)
-        out = {}
-        for k, q in enumerate(sizes):
-            own = strength if self.vector else float(np.clip(strength + rng.normal(0, 0.15), 0, 1))
-            size = q.small * (q.large / q.small) ** own
-            if self.vector:
-                size *= direction[k] if q.signed else abs(direction[k])
-            elif q.signed and rng.random() < 0.5:
-                size = -size
-            out[q.name] = float(size)
-        for q in self.quantities:
-            if q.shape:
-                out[q.name] = q.between(float(rng.random()))
-        return out
-
-
-def _some(rng: np.random.Generator, n: int) -> NDArray[np.bool_]:
-    """(n,) of which at least one is true."""
-    chosen: NDArray[np.bool_] = rng.random(n) < rng.choice([0.5, 1.0])
-    chosen[int(rng.integers(n))] = True
-    return chosen
-
 
 #: what an effect is to a diagnosis
 Cause = Effect

@@ -1,4 +1,4 @@
-"""The evidence of one recording, and what it comes to by what was learned: how likely nothing, each cause or something unknown is.
+"""The evidence of one recording: how far it is from the model, beyond what robots of one build are, and how far it goes along each cause.
 
 Templates and healthy robots are simulated for the recording at hand and kept under a name that says all that they follow from; what
 is simulated is counted in robots, never in seconds, so that the same recording gives the same answer on any computer.
@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import joblib
 import numpy as np
@@ -18,16 +19,15 @@ from numpy.typing import NDArray
 from openant_tools.arrays import read_arrays, write_arrays
 from openant_tools.errors import BadInput
 from openant_tools.gap.cache import cache_folder, keep_small
-from openant_tools.gap.classifier import classifier, weights
+from openant_tools.gap.decide import Anomaly
 from openant_tools.gap.ensemble import robots_at, templates_at, templates_of
-from openant_tools.gap.evidence import Evidence, Layouts, RunLayout, Scale, anomalies, evidence_of, unknown_signals
+from openant_tools.gap.evidence import Evidence, Layouts, Scale, anomalies, evidence_of, unknown_signals
 from openant_tools.gap.features import Floats
 from openant_tools.gap.hypothesis import Part, Refit, sized
 from openant_tools.gap.population import Case
-from openant_tools.gap.posterior import NONE, OUTSIDE, features_of, log_posterior
 from openant_tools.gap.protocol import RunSet
-from openant_tools.gap.refine import refined
 from openant_tools.gap.templates import Template
+from openant_tools.model.plant import Setup
 from openant_tools.workers import tied
 
 __all__ = ["Assessment", "assess", "layouts_of"]
@@ -39,35 +39,32 @@ MEASURE, OTHERS, BATCH = 72, 24, 32
 #: that templates are simulated in, beside each other
 PARTS = 4
 #: of simulated robots: raise it where the same recording gives others
-VERSION = 10
+VERSION = 11
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """What the evidence of a recording comes to.
+    """What is known of a recording before anything is fitted.
 
     Attributes:
-        none, outside: probabilities. leads: cause → that it leads the gap. present: cause → that it is there, whatever leads.
+        evidence: how far it goes along each cause. anomaly: how far it is from the model.
         set_aside: signal → times the farthest healthy robot by which it behaves as none that is known: it had no part in this.
         anomalies: signal → how far it is from the model's, in what healthy robots are off by: above 1 beyond nearly all of them.
-        evidence: the rows, of one robot. protocol: the recording as it was simulated for that. scale: what it was measured by. seen:
-            (features,) of the recording.
+        protocol: the recording as it was simulated for that. scale: what it was measured by. seen: (features,) of the recording.
     """
 
-    none: float
-    outside: float
-    leads: Mapping[str, float]
-    present: Mapping[str, float]
+    evidence: Evidence
+    anomaly: Anomaly
     set_aside: Mapping[str, float]
     anomalies: Mapping[str, float]
-    evidence: Evidence
     protocol: RunSet
     scale: Scale
     seen: Floats
 
-    def ranked(self) -> list[str]:
-        """Causes, the likeliest to lead first."""
-        return sorted(self.leads, key=lambda name: -self.leads[name])
+    @cached_property
+    def fit(self) -> Mapping[str, float]:
+        """Cause → deviations of healthy robots by which the recording goes along it."""
+        return dict(zip(self.evidence.causes, self.evidence.fit.tolist(), strict=True))
 
     @property
     def robots(self) -> int:
@@ -82,9 +79,9 @@ class Assessment:
         """Coordinates of its best template."""
         return self._best(cause)[2]
 
-    def further(self, known: Refit) -> list[tuple[Part, dict[str, float]]]:
-        """Where every cause would sit, and its coordinates, beside causes that were fitted: by what a robot that has these leaves of the
-        recording. The best fit first.
+    def further(self, known: Refit) -> list[tuple[Part, dict[str, float], float]]:
+        """Where every cause would sit, its coordinates, and how far what a robot with causes that were fitted leaves of the recording goes along
+        it, in deviations of healthy robots. The best fit first.
         """
         parts = zip(known.hypothesis, known.x, strict=True)
         case = Case({part.cause: (part.joints, dict(x)) for part, x in parts}, -1)
@@ -95,11 +92,11 @@ class Assessment:
         out = []
         for k in sorted((int(some[fit[some].argmax()]) for some in templates.of_cause), key=lambda k: -fit[k]):
             name, joints, x = templates.bank[k]
-            out.append((Part(name, joints), sized(name, x, float(fit[k] / length[k]))))
+            out.append((Part(name, joints), sized(name, x, float(fit[k] / length[k])), float(fit[k])))
         return out
 
     def _best(self, cause: str) -> Template:
-        return self.evidence.bank[int(self.evidence.places[0, self.evidence.causes.index(cause)])]
+        return self.evidence.bank[int(self.evidence.places[self.evidence.causes.index(cause)])]
 
 
 def assess(
@@ -116,17 +113,9 @@ def assess(
     templates, healthy = _simulated(coarse, name, bank, progress, jobs)
     layouts = layouts_of(coarse)
     nominal = coarse.nominal()
-    seen = np.concatenate([one.features(there)[0] for one, there in zip(coarse.runs, nominal, strict=True)])
+    seen = np.concatenate([one.features(there) for one, there in zip(coarse.runs, nominal, strict=True)])
     known = np.concatenate([one.layout.known(one.seen) for one in coarse.runs])
     set_aside: dict[str, float] = {}
-
-    def refined_with(known: Bools, cases: list[Case], features: Floats) -> tuple[list[Case], Floats]:
-        progress(0.9, "what the likeliest causes do at their best sizes")
-        scale = Scale.of(layouts, known, healthy[:MEASURE], features, cases, coarse.reference)
-        more, found = refined(scale, seen, lambda cases: _more(coarse, name, cases, jobs))
-        return [*cases, *more], np.concatenate([features, found])
-
-    bank, templates = refined_with(known, bank, templates)
     while True:
         scale = Scale.of(layouts, known, healthy[:MEASURE], templates, bank, coarse.reference)
         beyond = unknown_signals(scale, healthy[MEASURE:], seen)
@@ -135,35 +124,18 @@ def assess(
         worst = max(beyond, key=lambda name: beyond[name])
         set_aside[worst] = beyond[worst]
         known = known & (layouts.signal != worst)
-    if set_aside:  # what they said had a part in the sizes
-        bank, templates = refined_with(known, bank, templates)
-        scale = Scale.of(layouts, known, healthy[:MEASURE], templates, bank, coarse.reference)
-    evidence = evidence_of(scale, seen[None])
-    odds = classifier()(evidence.rows)
-    p = np.exp(log_posterior(features_of(evidence.rows, odds), weights()))[0]
+    evidence = evidence_of(scale, seen)
     progress(1.0, "evidence")
-    return Assessment(
-        float(p[NONE]),
-        float(p[OUTSIDE]),
-        dict(zip(evidence.causes, p[2:].tolist(), strict=True)),
-        dict(zip(evidence.causes, (1 / (1 + np.exp(-odds[0].astype(np.float64)))).tolist(), strict=True)),
-        set_aside,
-        anomalies(scale, healthy[MEASURE:], seen),
-        evidence,
-        coarse,
-        scale,
-        seen,
-    )
+    far = Anomaly(evidence.size, evidence.left)
+    return Assessment(evidence, far, set_aside, anomalies(scale, healthy[MEASURE:], seen), coarse, scale, seen)
 
 
 def layouts_of(protocol: RunSet) -> Layouts:
     """What the features of its runs are of."""
-    runs = []
-    for one in protocol.runs:
-        groups = one.layout.groups()
-        joints = {signal: one.layout.joints_of(signal) for signal in groups}
-        runs.append(RunLayout(str(one.plant.setup), one.run.duration_s, groups, joints))
-    return Layouts.of(runs, len(protocol.joints))
+    signals = [(name, one) for one in protocol.runs for name in one.signals]
+    counts = [len(one.layout.joints_of(name)) for name, one in signals]
+    floor = [one.plant.setup is Setup.FLOOR for _, one in signals]
+    return Layouts(np.repeat([name for name, _ in signals], counts), np.repeat(floor, counts))
 
 
 def _simulated(
@@ -172,7 +144,9 @@ def _simulated(
     """(templates, features) and (healthy robots, features), of all runs side by side."""
 
     def make() -> dict[str, Floats]:
-        work = _of_templates(protocol, bank)
+        # As many parts on any computer, so that they come to the same.
+        step = -(-len(bank) // PARTS)
+        work = [joblib.delayed(tied(templates_at))(protocol, bank[n : n + step]) for n in range(0, len(bank), step)]
         parts = len(work)
         healthy = [Case({}, seed) for seed in range(MEASURE + OTHERS)]
         work += [
@@ -186,23 +160,6 @@ def _simulated(
 
     stored = _cached(name, make)
     return stored["templates"], stored["healthy"]
-
-
-def _more(protocol: RunSet, name: str, cases: Sequence[Case], jobs: int) -> Floats:
-    """(cases, features) of more templates."""
-
-    def make() -> dict[str, Floats]:
-        done = joblib.Parallel(n_jobs=jobs)(_of_templates(protocol, cases))
-        return {"templates": np.concatenate([np.concatenate(part, axis=1) for part in done])}
-
-    asked = hashlib.sha256(json.dumps([list(case.causes.items()) for case in cases]).encode()).hexdigest()
-    return _cached(f"{name}-{asked[:12]}", make)["templates"]
-
-
-def _of_templates(protocol: RunSet, cases: Sequence[Case]) -> list[object]:
-    # As many parts on any computer, so that they come to the same.
-    step = -(-len(cases) // PARTS)
-    return [joblib.delayed(tied(templates_at))(protocol, cases[n : n + step]) for n in range(0, len(cases), step)]
 
 
 def _cached(name: str, make: Callable[[], dict[str, Floats]]) -> Mapping[str, Floats]:

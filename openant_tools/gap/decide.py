@@ -1,9 +1,10 @@
 """The decision: a pure function of frozen rows, one for each hypothesis, of learned weights and of explicit costs.
 
-A row says how likely its cause is to lead by the evidence, and what its fit says of it: how much less of the gap it leaves on held-out data
-than a re-fit within tolerance does, how much less it should leave there, how evenly joints share it, and how much likelier it made what it was
-fitted to. So data speak for a cause and against it: one that leaves more, or that should leave less and does not, is no longer likely,
-whatever the evidence said. Where all that is known leaves much at one joint and little at the others, something else is at that joint.
+A row says how far the recording goes along what its cause does, and what its fit says of it: how much less of the gap it leaves on
+held-out data than a re-fit within tolerance does, how much less it should leave there, how evenly joints share it, and how much likelier
+it made what it was fitted to. So data speak for a cause and against it: one that leaves more, or that should leave less and does not, is no
+longer likely, however well its template fits. Where all that is known leaves much at one joint and little at the others, something else is at
+that joint.
 """
 
 from __future__ import annotations
@@ -19,24 +20,29 @@ import numpy as np
 
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED
 
-__all__ = ["OUTSIDE", "WEIGHTS", "Decision", "Row", "adds", "chances", "decide", "weights", "worth_fitting"]
+__all__ = [
+    "OUTSIDE", "PRESENT", "WEIGHTS", "Anomaly", "Decision", "Row", "chances", "decide", "presence", "present", "weights",
+    "worth_fitting",
+]  # fmt: skip
 
-#: the weights by their names: of logarithms of probabilities by the evidence; of what held-out data say of a cause, of how much more its fit
-#: had promised, of how much more evenly it leaves joints; of how much likelier it made what it was fitted to than any robot of one build; of
-#: what innovations say of commands; of nothing and of something unknown by themselves, and of this by how unevenly joints are left
+#: the weights by their names: of how far a recording goes along a cause; of what held-out data say of it, of how much more its fit had
+#: promised, of how much more evenly it leaves joints; of how much likelier it made what it was fitted to than any robot of one build; of
+#: what innovations say of commands; of nothing and of something unknown by themselves, of these by how far the recording is from the model
+#: and by how unevenly joints are left; of a further cause by itself, and of how far what others leave goes along it
 WEIGHTS = (
-    "evidence", "support", "shortfall", "uneven", "beyond", "irregular", "none", "outside", "outside: uneven",
+    "fit", "support", "shortfall", "uneven", "beyond", "irregular", "none", "none: size", "outside", "outside: left",
+    "outside: uneven", "beside", "beside: fit",
 )  # fmt: skip
 #: where they lie in this package
 FILE = "decision.json"
 #: of what no catalogue has, beside the names of causes
 OUTSIDE = "outside"
-#: least probability by the evidence that counts
-LEAST = 1e-6
 #: nats by which held-out data speak strongly against a cause
 STRONGLY = 3.0
 #: nats beyond which what was fitted says little more: no model of a real robot is true, and a wrong cause can be surer than any right one
 SURE = 30.0
+#: times what healthy robots differ by beyond which a recording that differs more says no more of what it is
+FARTHEST = 3.0
 #: what it costs to give a wrong name, to say that nothing is wrong where something is, to leave open what is known (an open question is
 #: better than a wrong all-clear), and to name it as one of two
 WRONG, MISSED, OPEN, EITHER = 1.0, 0.8, 0.7, 0.2
@@ -45,12 +51,25 @@ PRESENT = 0.5
 
 
 @dataclass(frozen=True)
+class Anomaly:
+    """How far a recording is from the model once tolerances have taken what they may: 1 where it differs as healthy robots do.
+
+    Attributes:
+        size: root mean square. left: the same without what its best cause explains.
+    """
+
+    size: float
+    left: float
+
+
+@dataclass(frozen=True)
 class Row:
     """One hypothesis.
 
     Attributes:
         causes: names, the one that is asked about last; empty for none. joints: of each cause, indices.
-        probability: by the evidence: that it leads, or of a further cause that it is there; of none, that nothing leads.
+        fit: deviations of healthy robots by which the recording, or what the others leave of it, goes along what the cause does.
+        leads: whether it may be what leads the gap. expected: nats that its builder's word adds.
         support: logarithm of how much less it leaves of the gap on held-out folds, mean of them and summed over joints, than what it is compared
             with does (no further cause, or the others); None where it was not fitted, or where nothing that was recorded
             tells.
@@ -64,7 +83,9 @@ class Row:
 
     causes: tuple[str, ...]
     joints: tuple[tuple[int, ...], ...] = ()
-    probability: float = 0.0
+    fit: float = 0.0
+    leads: bool = True
+    expected: float = 0.0
     support: float | None = None
     foretold: float = 0.0
     uneven: float | None = None
@@ -136,30 +157,33 @@ def _fitted(rows: Sequence[Row], uneven: float, weights: Mapping[str, float]) ->
     return out
 
 
-def chances(rows: Sequence[Row], outside: float, weights: Mapping[str, float]) -> dict[str, float]:
+def chances(rows: Sequence[Row], anomaly: Anomaly, weights: Mapping[str, float]) -> dict[str, float]:
     """NONE, OUTSIDE and the cause of each hypothesis of one at most → probability; they come to one."""
     uneven = min((row.uneven for row in rows if row.uneven is not None), default=0.0)
-    logits = {OUTSIDE: weights["outside"] + weights["outside: uneven"] * uneven + weights["evidence"] * _log(outside)}
+    logits = {
+        OUTSIDE: weights["outside"]
+        + weights["outside: left"] * _decades(anomaly.left)
+        + weights["outside: uneven"] * uneven,
+        NONE: weights["none"] - weights["none: size"] * _decades(anomaly.size),
+    }
     none = next(row for row in rows if not row.causes)
-    singles = [row for row in rows if len(row.causes) == 1]
+    singles = [row for row in rows if len(row.causes) == 1 and row.leads]
     said = _fitted(singles, none.uneven or 0.0, weights)
-    for row in (none, *singles):
-        name, more = (row.causes[0], said.get(row.causes, 0.0)) if row.causes else (NONE, weights["none"])
-        logits[name] = weights["evidence"] * _log(row.probability) + more
+    for row in singles:
+        logits[row.causes[0]] = weights["fit"] * _along(row.fit) + row.expected + said.get(row.causes, 0.0)
     # Sorted: sums of the same numbers are the same, in whatever order rows come.
     whole = float(np.logaddexp.reduce(sorted(logits.values())))
-    return {name: math.exp(one - whole) for name, one in logits.items()}
+    led = {name: math.exp(one - whole) for name, one in logits.items()}
+    return {row.causes[0]: 0.0 for row in rows if len(row.causes) == 1} | led
 
 
-def decide(rows: Sequence[Row], outside: float) -> Decision:
+def decide(rows: Sequence[Row], anomaly: Anomaly) -> Decision:
     """The verdict that costs least.
 
     Args:
-        rows: the hypotheses, one of them without causes; of several causes, which were found to be there together, what they
-            leave. outside: probability, by the evidence, of something that no catalogue has.
+        rows: the hypotheses, one of them without causes; of several causes, which were found to be there together, what they leave.
     """
-    learned = weights()
-    p = chances(rows, outside, learned)
+    p = chances(rows, anomaly, weights())
     none, unknown = p.pop(NONE), p.pop(OUTSIDE)
     named = sorted(p, key=lambda name: (-p[name], name))
     costs = {NONE: MISSED * (1 - none), UNEXPLAINED: OPEN * (1 - unknown - none) + WRONG * none}
@@ -182,36 +206,44 @@ def decide(rows: Sequence[Row], outside: float) -> Decision:
     return Decision(verdict, p[verdict], p, (best,))
 
 
-def worth_fitting(probability: Mapping[str, float], likelier: Mapping[str, float]) -> list[str]:
-    """Causes in the order in which they may come out, by the evidence (0…1) and by how much likelier (nats) their first steps make the data."""
+def worth_fitting(fit: Mapping[str, float], likelier: Mapping[str, float]) -> list[str]:
+    """Causes in the order in which they may come out, by how far the recording goes along them and by how much likelier (nats) their first
+    steps make it."""
     learned = weights()
 
     def worth(name: str) -> float:
-        return learned["evidence"] * _log(probability[name]) + learned["beyond"] * _sure(max(likelier[name], 0.0))
+        return learned["fit"] * _along(fit[name]) + learned["beyond"] * _sure(max(likelier[name], 0.0))
 
     return sorted(likelier, key=worth, reverse=True)
 
 
-def adds(rows: Sequence[Row], uneven: float) -> Row | None:
-    """Of hypotheses with one cause more than is selected, the likeliest one whose last cause is likelier there than not.
+def presence(fit: float, weights: Mapping[str, float], said: float = 0.0) -> float:
+    """Probability that a cause is there beside others.
+
+    Args:
+        fit: deviations of healthy robots by which what these leave goes along what it does. said: nats, what its own fit says of it.
+    """
+    return 1 / (1 + math.exp(-(weights["beside"] + weights["beside: fit"] * _along(fit) + said)))
+
+
+def present(rows: Sequence[Row], uneven: float, weights: Mapping[str, float]) -> dict[str, float]:
+    """Of hypotheses with one cause more than is selected, that cause → probability that it is there, where data say anything of it.
 
     Args:
         uneven: as what is selected leaves it.
     """
-    learned = weights()
-    said = _fitted(rows, uneven, learned)
-
-    def probability(row: Row) -> float:
-        odds = _log(row.probability) - _log(1 - row.probability)
-        return 1 / (1 + math.exp(-(learned["evidence"] * odds - learned["none"] + said[row.causes])))
-
-    likeliest = max((row for row in rows if row.causes in said), key=probability, default=None)
-    return likeliest if likeliest is not None and probability(likeliest) > PRESENT else None
+    said = _fitted(rows, uneven, weights)
+    return {row.causes[-1]: presence(row.fit, weights, said[row.causes]) for row in rows if row.causes in said}
 
 
 def _sure(nats: float) -> float:
     return SURE * math.asinh(nats / SURE)
 
 
-def _log(probability: float) -> float:
-    return math.log(max(probability, LEAST))
+def _along(deviations: float) -> float:
+    """nats by which what was recorded is likelier with a cause along which it goes so far."""
+    return _sure(0.5 * deviations**2)
+
+
+def _decades(size: float) -> float:
+    return math.log10(min(max(size, 1 / FARTHEST), FARTHEST))

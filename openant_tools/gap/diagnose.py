@@ -11,6 +11,7 @@ import difflib
 import hashlib
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +20,10 @@ from threadpoolctl import threadpool_limits
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.errors import BadInput
 from openant_tools.gap.assess import Assessment, assess
-from openant_tools.gap.decide import Row, adds, decide, worth_fitting
+from openant_tools.gap.decide import PRESENT, Row, decide, present, weights, worth_fitting
 from openant_tools.gap.diagnosis import UNEXPLAINED, Diagnosis
 from openant_tools.gap.experiment import Experiment
-from openant_tools.gap.finding import Given, finding
+from openant_tools.gap.finding import Given, Tried, finding
 from openant_tools.gap.trials import Trials
 from openant_tools.numbers import number
 from openant_tools.recording.run import Run
@@ -32,7 +33,8 @@ __all__ = ["diagnose", "hypotheses", "prepare"]
 
 Progress = Callable[[float, str], None]
 
-#: causes whose first steps are looked at, the likeliest by the evidence, and that are fitted then: by themselves, and beside what is chosen
+#: causes whose first steps are looked at, those that the recording goes along farthest, and that are fitted then: by themselves, and beside
+#: what is chosen
 TRIED, SUSPECTS = 15, 5
 SECONDS, FURTHER = 6, 2
 #: causes of one improved model
@@ -78,47 +80,53 @@ def diagnose(
     experiment = Experiment.of(sorted(runs, key=_content), model, wanted, sorted(hold_out, key=_content))
     tell(0.02, str(experiment.selection))
     trials, rows = hypotheses(experiment, prior, lambda share, words: tell(0.02 + 0.73 * share, words))
-    assessment = trials.assessment
-    decision = decide(rows, assessment.outside)
+    decision = decide(rows, trials.assessment.anomaly)
     # Others are looked for also beside a cause than which something unknown is likelier so far, or another cause as likely.
     chosen = (decision.likeliest,) if decision.verdict == UNEXPLAINED else decision.causes
-    declined: list[Row] = []
+    declined, there = list[Row](), dict[str, float]()
     if chosen not in trials.closures:  # named by the evidence alone: held-out data do not tell of it
         trials.fit([(), chosen])
     while chosen in trials.closures and 0 < len(chosen) < CAUSES:
         tell(0.8 + 0.05 * len(chosen), f"what acts beside {' and '.join(chosen)}")
         further = _further(trials, chosen, [name for group in decision.alike for name in group])
         trials.fit([chosen, *further])
-        asked = [trials.row(causes, assessment.present[causes[-1]]) for causes in further]
-        more = adds(asked, trials.closures[chosen].uneven)
+        asked = [trials.row(causes) for causes in further]
+        there |= (said := present(asked, trials.closures[chosen].uneven, weights()))
+        likely = [row for row in asked if said.get(row.causes[-1], 0.0) > PRESENT]
+        more = max(likely, key=lambda row: said[row.causes[-1]], default=None)
         declined += [row for row in asked if row is not more]
         if more is None:
             break
         chosen = more.causes
         rows.append(more)
     # What several causes explain together is not unexplained, and those that are both there are no alternatives.
-    decision = decide(rows, assessment.outside)
+    decision = decide(rows, trials.assessment.anomaly)
     if not set(decision.causes) & set(chosen):
         chosen = decision.causes
     tell(1.0, "decision")
     given = Given(model, tuple(runs), tuple(hold_out), tuple(prior))
-    return finding(trials, given, rows, declined, decision, chosen)
+    return finding(trials, given, Tried(rows, declined, there), decision, chosen)
 
 
 def hypotheses(experiment: Experiment, prior: Sequence[str], progress: Progress) -> tuple[Trials, list[Row]]:
     """What is decided on: no cause, and each by itself, the likeliest of them fitted."""
     assessment = assess(experiment.protocol, lambda share, words: progress(0.8 * share, words))
-    leads = _expected(assessment, prior)
-    ranked = sorted(leads, key=lambda name: -leads[name])
-    trials = Trials.of(experiment, assessment)
+    trials, fit = Trials.of(experiment, assessment), assessment.fit
+    leading = {name for name in fit if _leads(assessment, name)}
     # By itself first: causes begin where tolerances have come to, with what was learnt of them, and so does none.
     trials.fit([()])
     progress(0.82, "where the likeliest causes lead")
-    worth = worth_fitting(leads, trials.promise([(name,) for name in ranked if trials.tells(name)][:TRIED]))
-    suspects = worth[:SUSPECTS] + [name for name in prior if name in ranked and name not in worth[:SUSPECTS]]
+    ranked = sorted((name for name in leading if trials.tells(name)), key=lambda name: (-fit[name], name))
+    worth = worth_fitting(fit, trials.promise([(name,) for name in ranked[:TRIED]]))
+    suspects = worth[:SUSPECTS] + [name for name in prior if name in fit and name not in worth[:SUSPECTS]]
     progress(0.86, "what those worth it close on held-out parts")
     trials.fit([(), *((name,) for name in suspects)])
-    return trials, [trials.none(), *(trials.row((name,), leads[name]) for name in ranked)]
+    word = dict.fromkeys(prior, math.log(EXPECTED))
+    rows = [
+        replace(trials.row((name,)), leads=name in leading, expected=word.get(name, 0.0))
+        for name in sorted(fit, key=lambda name: (-fit[name], name))
+    ]
+    return trials, [trials.none(), *rows]
 
 
 @_alike_everywhere()
@@ -142,22 +150,18 @@ def _further(trials: Trials, chosen: tuple[str, ...], alike: Sequence[str]) -> l
     """
     found = trials.further(chosen)
     told = [causes for causes in found if trials.tells(causes[-1])][:SECONDS]
-    worth = worth_fitting(trials.assessment.present, trials.promise(told, chosen))
+    left = {causes[-1]: trials.along[causes] for causes in told}
+    worth = worth_fitting(left, trials.promise(told, chosen))
     random = [] if any(catalogue()[name].random for name in chosen) else [c for c in found if catalogue()[c[-1]].random]
     also = [name for name in alike if name not in chosen and trials.tells(name)]
     return [*((*chosen, name) for name in dict.fromkeys([*also, *worth[:FURTHER]])), *random]
 
 
-def _expected(assessment: Assessment, prior: Sequence[str]) -> dict[str, float]:
-    """Cause → how likely it leads, with what its builder declared, and where a cause of sensors alone may lead at all."""
+def _leads(assessment: Assessment, name: str) -> bool:
+    """Whether a cause may lead: a gap is led by where it is largest, and a sensor that is off is none of a motion that is."""
     moves = assessment.anomalies.get("pos", 0.0)
     elsewhere = max((size for signal, size in assessment.anomalies.items() if signal != "pos"), default=0.0)
-    out = {}
-    for name, probability in assessment.leads.items():
-        # A gap is led by where it is largest: a sensor that is off is none of a motion that is.
-        of_sensors = catalogue()[name].of_sensors_at(assessment.template(name))
-        out[name] = probability * (EXPECTED if name in prior else 1.0) * (not of_sensors or elsewhere >= moves)
-    return out
+    return elsewhere >= moves or not catalogue()[name].of_sensors_at(assessment.template(name))
 
 
 def _check(runs: Sequence[Run], hold_out: Sequence[Run]) -> None:

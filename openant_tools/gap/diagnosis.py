@@ -67,7 +67,7 @@ class Diagnosis:
         refuted: effect → what signature speaks against it, in words.
         notes: what it rests on, and what more signals would add.
         sensors: what was found about signals, and whether they had a part in the verdict.
-        rows: what was decided on, see `gap.decide.Row`; "outside" among them has no row of its own but its probability.
+        rows: what was decided on, see `gap.decide.Row`. anomaly: `gap.decide.Anomaly`.
         declined: in the same form what was asked for beside what had been chosen, and not added.
     """
 
@@ -90,6 +90,7 @@ class Diagnosis:
     sensors: Sequence[Mapping[str, Any]] = ()
     rows: Sequence[Mapping[str, Any]] = ()
     declined: Sequence[Mapping[str, Any]] = ()
+    anomaly: Mapping[str, float] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
         """As formats, section 2, has it; what is ours alone comes after."""
@@ -130,6 +131,7 @@ class Diagnosis:
             "notes": list(self.notes),
             "rows": [dict(row) for row in self.rows],
             "declined": [dict(row) for row in self.declined],
+            "anomaly": dict(self.anomaly),
         }
 
 
@@ -178,6 +180,7 @@ def read_diagnosis(path: Path) -> Diagnosis:
             rest=text.get("rest", {}), sensors=tuple(text.get("sensors", ())), refuted=text.get("refuted", {}),
             rows=tuple(text.get("rows", ())),
             declined=tuple(text.get("declined", ())),
+            anomaly=text.get("anomaly", {}),
         )  # fmt: skip
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise BadInput(

@@ -1,7 +1,7 @@
 """Simulated robots on a recording's own commands, in its own windows: one for each cause, and healthy ones as varied as one build.
 
 What each cause does to this recording, what tolerances and sensors do, and what noise is left follow from the physics of the
-model at hand; nothing of it is learned. How such evidence weighs is (`gap.classifier`).
+model at hand; nothing of it is learned. How such evidence weighs is (`gap.decide`).
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def _only(case: Case) -> int:
 
 def _joints(played: Played) -> Ints:
     """(features,) the joint of each, −1 for those of none."""
-    return np.concatenate([played.layout.joints_of(signal) for signal in played.layout.groups()])
+    return np.concatenate([played.layout.joints_of(signal) for signal in played.signals])
 
 
 def _side_by_side(bank: Sequence[Case], played: Played) -> list[list[int]]:

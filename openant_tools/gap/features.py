@@ -1,8 +1,7 @@
-"""What a judge looks at: how a robot's log differs from the simulation's, in pieces long enough to be steady.
+"""What evidence is made of: how a robot's log differs from the simulation's, averaged over pieces long enough to be steady.
 
-Single samples on the floor chatter (a gram more moves them by many deviations), so that differences are averaged over
-blocks; what scatters within a block enters as the logarithm of its size. Commands that come late or never leave no mean at all:
-by how much each row is late, by the word of every joint and of all together, enters as the size and the peaks of its scatter.
+Single samples on the floor chatter: a gram more moves them by many deviations. Commands that come late or never leave no mean at all;
+they are looked for in what fits leave (`gap.innovations`).
 """
 
 from __future__ import annotations
@@ -13,16 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.effects.robot import USUAL_NOISE, Robot
-from openant_tools.gap.arrivals import KINDS_OF_ONE, Arrivals
-from openant_tools.gap.imu_delay import KINDS, ImuDelay
-from openant_tools.gap.neighbours import against_neighbours
+from openant_tools.effects.robot import Robot
 from openant_tools.model.plant import Setup
 from openant_tools.recording.run import Run
 
-__all__ = [
-    "ARRIVAL", "COLUMNS", "IMU_DELAY", "LATENESS", "SKIP_S", "Layout", "Signals", "around_switching", "logged", "with_noise",
-]  # fmt: skip
+__all__ = ["COLUMNS", "Floats", "Layout", "Signals", "around_switching", "differences", "logged", "with_noise"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -49,14 +43,6 @@ TAKES_UP_S = 0.3
 LETS_GO_S = 0.03
 #: factors within which one joint may need another scale of torque than most: servos of a robot differ so far in N·m per ampere
 OWN_SCALE = 2.0
-#: least size of a scatter, as a share of the signal's noise
-LEAST = 0.3
-#: what the features of rows that are late are called, those of commands, and those of the body behind its legs
-LATENESS, ARRIVAL, IMU_DELAY = "lateness", "arrival", "imu_delay"
-#: rad/s, a speed from which positions tell how late a row is
-TELLS_RAD_S = 1.0
-#: s, the least size of a scatter of lateness
-LEAST_LATE_S = 1e-4
 
 
 @dataclass(frozen=True)
@@ -68,8 +54,6 @@ class Layout:
         signals: which, in order; positions of joints among them.
         seconds: how long the protocol's run is: a log that goes on longer is cut there.
         unsure: (rows, joints) as `around_switching`.
-        arrivals: the run's commands; None where nothing is asked of when they came.
-        imu_delay: the rows at which body and legs are compared; None where no body moves.
     """
 
     t: Array
@@ -78,8 +62,6 @@ class Layout:
     signals: tuple[str, ...]
     seconds: float
     unsure: Bools
-    arrivals: Arrivals | None = None
-    imu_delay: ImuDelay | None = None
 
     def blocks(self, signal: str) -> Array:
         """Edges of the blocks of a signal, s."""
@@ -91,32 +73,13 @@ class Layout:
         edges: Array = SKIP_S + width * np.arange(count + 1, dtype=np.float64)
         return edges
 
-    def groups(self) -> dict[str, list[str]]:
-        """Signal → the names of its features, in the order of `features`."""
-        out: dict[str, list[str]] = {}
-        for signal in self.signals:
-            n = _width(signal, self.joints)
-            count = len(self.blocks(signal)) - 1
-            out[signal] = ["mean"] * (count * n) + ["size"] * n + ["rough"] * n
-        n = self.joints + 1
-        out[LATENESS] = ["size"] * n + ["peak"] * n
-        if self.arrivals is not None:
-            out[ARRIVAL] = [kind for kind in KINDS_OF_ONE for _ in range(n)] + ["shared"]
-        if self.imu_delay is not None:
-            out[IMU_DELAY] = list(KINDS)
-        return out
-
     def joints_of(self, signal: str) -> list[int]:
-        """The joint of each of a signal's features, in the order of `features`; −1 for those of no joint, or of all."""
-        if signal == LATENESS:
-            return 2 * [*range(self.joints), -1]
-        if signal == ARRIVAL:
-            return len(KINDS_OF_ONE) * [*range(self.joints), -1] + [-1]
-        count = len(self.groups()[signal])
-        return [-1] * count if signal in (*COLUMNS, IMU_DELAY) else [k % self.joints for k in range(count)]
+        """The joint of each of a signal's features, in the order of `features`; −1 for those of no joint."""
+        blocks = len(self.blocks(signal)) - 1
+        return [-1] * (blocks * len(COLUMNS[signal])) if signal in COLUMNS else [*range(self.joints)] * blocks
 
     def features(self, seen: Signals, simulated: Signals) -> Floats:
-        """(robots, features): block means, and logarithms of sizes, of how logs differ from what the model does.
+        """(robots, features): block means of how logs differ from what the model does.
 
         Args:
             seen: (robots, rows, columns) of each signal. simulated: the same of the model, one for all robots.
@@ -127,67 +90,23 @@ class Layout:
                 name: np.where(self.unsure, np.float32(np.nan), x) for name, x in apart.items() if name not in COLUMNS
             }
         for signal in self.signals:
-            x = apart[signal]
-            edges = self.blocks(signal)
-            means = _means(x, self.t, edges)
+            means = _means(apart[signal], self.t, self.blocks(signal))
             if signal in DRIFTING:
                 means = means - _mean(means)[:, None]
-            n = x.shape[0]
-            size = np.log10(np.sqrt(_mean(np.square(means))) + _least(signal))
-            rough = self._roughness(signal, x)
-            parts += [np.nan_to_num(means).reshape(n, -1), np.nan_to_num(size), np.nan_to_num(rough)]
-        parts += self._lateness(apart["pos"], simulated["pos"])
-        if self.arrivals is not None:
-            parts += self.arrivals(apart["pos"], simulated["pos"][0])
-        if self.imu_delay is not None:
-            parts.append(self.imu_delay(seen["pos"], seen["gyro"]))
+            parts.append(np.nan_to_num(means).reshape(len(means), -1))
         return np.concatenate(parts, axis=1).astype(np.float32)
 
     def known(self, seen: Signals) -> Bools:
         """(features,) which of them a log of (1, rows, columns) signals has: those of which it has any sample."""
         parts: list[Bools] = []
         for signal in self.signals:
-            n = _width(signal, self.joints)
+            n = len(COLUMNS[signal]) if signal in COLUMNS else self.joints
             there = np.isfinite(seen[signal][:1]) if signal in seen else np.zeros((1, len(self.t), n), bool)
             if signal not in COLUMNS:
                 there = there & ~self.unsure
             counts = _means(np.where(there, 1.0, np.nan).astype(np.float32), self.t, self.blocks(signal))
-            ever = there[0, self.t >= SKIP_S].any(axis=0)
-            parts += [np.isfinite(counts[0]).ravel(), ever, ever]
-        groups = self.groups()
-        parts += [np.ones(len(groups[LATENESS]), bool)]
-        if self.arrivals is not None:
-            parts += [np.ones(len(groups[ARRIVAL]), bool)]
-        if self.imu_delay is not None:
-            parts += [np.full(len(groups[IMU_DELAY]), "gyro" in seen)]
+            parts.append(np.isfinite(counts[0]).ravel())
         return np.concatenate(parts)
-
-    def _lateness(self, x: Floats, simulated: Floats) -> list[Floats]:
-        """Logarithms of how far rows scatter in time, and of how much of that is in few of them; (robots, joints + 1) each.
-
-        A row that is late by τ lies τ times its speed behind those about it: each joint says so, as far as it moves, and where one
-        bus serves them all, they say the same.
-
-        Args:
-            x: (robots, rows, joints) rad, NaN where nobody knows. simulated: the same of the model.
-        """
-        jump = against_neighbours(x, self.t)[:, self.t >= SKIP_S]
-        speed = np.nan_to_num(np.gradient(simulated, self.t, axis=1))[:, self.t >= SKIP_S]
-        weight = np.square(speed) + TELLS_RAD_S**2
-        late = np.concatenate(
-            [-jump * speed / weight, -(jump * speed).sum(axis=2, keepdims=True) / weight.sum(axis=2, keepdims=True)],
-            axis=2,
-        )
-        size = np.sqrt(np.mean(np.square(late), axis=1)) + LEAST_LATE_S
-        peak = np.mean(late**4, axis=1) ** 0.25 + LEAST_LATE_S
-        return [np.log10(size), np.log10(peak / size)]
-
-    def _roughness(self, signal: str, x: Floats) -> Floats:
-        """(robots, columns): logarithm of what scatters faster than blocks."""
-        seen = self.t >= SKIP_S
-        change = np.diff(x[:, seen], axis=1)
-        out: Floats = np.log10(np.sqrt(_mean(np.square(change))) + LEAST * _least(signal))
-        return out
 
 
 def around_switching(run: Run, joints: Sequence[str]) -> Bools:
@@ -292,14 +211,6 @@ def with_noise(
             y = y + step * between
         out[name] = (np.round(y / step) * step if step > 0 else y).astype(np.float32)
     return out
-
-
-def _width(signal: str, joints: int) -> int:
-    return len(COLUMNS[signal]) if signal in COLUMNS else joints
-
-
-def _least(signal: str) -> float:
-    return LEAST * USUAL_NOISE[signal]
 
 
 def _unloaded(x: Floats) -> Floats:

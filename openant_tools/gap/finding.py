@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.effect import Scope
 from openant_tools.gap.closure import Closure, calibration_of, heat_loss_of
-from openant_tools.gap.decide import OUTSIDE, Decision, Row
+from openant_tools.gap.decide import Decision, Row, presence, weights
 from openant_tools.gap.diagnosis import UNEXPLAINED, Diagnosis, Found, Span
 from openant_tools.gap.measure import measure
 from openant_tools.gap.next import suggestion
@@ -43,19 +43,29 @@ class Given:
     prior: tuple[str, ...]
 
 
-def finding(
-    trials: Trials,
-    given: Given,
-    rows: Sequence[Row],
-    declined: Sequence[Row],
-    decision: Decision,
-    chosen: tuple[str, ...],
-) -> Diagnosis:
+@dataclass(frozen=True)
+class Tried:
+    """What was decided on.
+
+    Attributes:
+        rows: no cause, each by itself, and what was added to one. declined: what was asked for beside one and not added.
+        there: of causes asked for beside one, how likely each is there.
+    """
+
+    rows: Sequence[Row]
+    declined: Sequence[Row]
+    there: Mapping[str, float]
+
+    @property
+    def singles(self) -> list[Row]:
+        return [row for row in self.rows if len(row.causes) == 1]
+
+
+def finding(trials: Trials, given: Given, tried: Tried, decision: Decision, chosen: tuple[str, ...]) -> Diagnosis:
     """The diagnosis that is handed on.
 
     Args:
-        rows: the causes by themselves, and what was added to one. declined: what was asked for beside one and not added. chosen: causes
-            that go into the improved model, the one that leads first.
+        chosen: causes that go into the improved model, the one that leads first.
     """
     experiment, predictions = trials.experiment, trials.fits.predictions
     best, plain = trials.closures.get(chosen), trials.closures[()]
@@ -76,8 +86,12 @@ def finding(
     elif decision.verdict == UNEXPLAINED:
         closest = trials.closures.get((decision.likeliest,), plain)
         rest = residual_after(predictions, closest.refit, judged, measured)[0]
+    there = _there(trials, tried, chosen)
     effects = sorted(
-        (_found(trials, row, best, decision.chances[row.causes[0]]) for row in rows if len(row.causes) == 1),
+        (
+            _found(trials, row, best, max(decision.chances[row.causes[0]], there[row.causes[0]]))
+            for row in tried.singles
+        ),
         key=lambda one: -_rank(one, decision, chosen),
     )
     return Diagnosis(
@@ -99,19 +113,29 @@ def finding(
         where=where,
         calibration=calibration,
         removal=removal,
-        refuted={row.causes[0]: _why_not(row, plain) for row in rows if len(row.causes) == 1 and row.refuted},
+        refuted={row.causes[0]: _why_not(row, plain) for row in tried.singles if row.refuted},
         notes=tuple(notes),
         rest={} if rest is None else rest.as_json(),
-        sensors=_sensors(trials, given),
-        rows=(*map(_row, rows), _row(Row((OUTSIDE,), probability=trials.assessment.outside))),
-        declined=tuple(map(_row, declined)),
+        sensors=_sensors(trials, given, there),
+        rows=tuple(map(_row, tried.rows)),
+        declined=tuple(map(_row, tried.declined)),
+        anomaly=asdict(trials.assessment.anomaly),
     )
 
 
 def _row(row: Row) -> dict[str, Any]:
     """What is decided on, so that it can be decided anew and weights be learned from it."""
-    kept = ("causes", "probability", "support", "foretold", "uneven", "likelier", "within", "irregular")
-    return {name: getattr(row, name) for name in kept}
+    kept = asdict(row)
+    del kept["joints"], kept["gain"]
+    return kept
+
+
+def _there(trials: Trials, tried: Tried, chosen: tuple[str, ...]) -> dict[str, float]:
+    """Cause → how likely it is there beside what is chosen, whatever leads."""
+    known = trials.closures.get(chosen, trials.closures[()]).refit
+    return {part.cause: presence(fit, weights()) for part, _, fit in trials.assessment.further(known)} | dict(
+        tried.there
+    )
 
 
 def _rank(one: Found, decision: Decision, chosen: Sequence[str]) -> float:
@@ -127,8 +151,8 @@ def _why_not(row: Row, plain: Closure) -> str:
     return f"on held-out data it {words} than a re-fit within tolerance, which closes {percent(plain.closed)}"
 
 
-def _found(trials: Trials, row: Row, best: Closure | None, leads: float) -> Found:
-    """One cause, as it is in the improved model if that has it, else by itself; `leads` is how likely it leads."""
+def _found(trials: Trials, row: Row, best: Closure | None, probability: float) -> Found:
+    """One cause, as it is in the improved model if that has it, else by itself."""
     (name,) = row.causes
     effect, protocol, assessment = catalogue()[name], trials.experiment.parts, trials.assessment
     alone, at = trials.closures.get((name,)), assessment.place(name)
@@ -137,7 +161,7 @@ def _found(trials: Trials, row: Row, best: Closure | None, leads: float) -> Foun
     within = [] if best is None else [part.cause for part in best.refit.hypothesis]
     of = best if name in within else alone
     if of is None:
-        x, length = dict(trials.size(name)), float(evidence.deviations[0, c])
+        x, length = dict(trials.size(name)), float(evidence.deviations[c])
         std = {q.name: 0.0 if q.shape else abs(assessment.template(name)[q.name]) * length for q in effect.quantities}
     else:
         k = [part.cause for part in of.refit.hypothesis].index(name)
@@ -165,7 +189,7 @@ def _found(trials: Trials, row: Row, best: Closure | None, leads: float) -> Foun
     elif len(at) == len(protocol.joints) and Scope.ALL in effect.scopes:
         joints = "all"
     return Found(
-        name, joints, spans, max(leads, assessment.present[name]), None if alone is None else alone.closed,
+        name, joints, spans, probability, None if alone is None else alone.closed,
         None if alone is None else alone.low, None if alone is None else alone.high, effect.native, x,
     )  # fmt: skip
 
@@ -196,11 +220,11 @@ def _notes(trials: Trials, given: Given, decision: Decision) -> list[str]:
     return notes
 
 
-def _sensors(trials: Trials, given: Given) -> tuple[dict[str, Any], ...]:
-    """What was found of each signal of the log."""
+def _sensors(trials: Trials, given: Given, there: Mapping[str, float]) -> tuple[dict[str, Any], ...]:
+    """What was found of each signal of the log; `there` is how likely each cause is."""
     protocol, assessment = trials.experiment.protocol, trials.assessment
     out: list[dict[str, Any]] = []
-    acting = {name: assessment.template(name) for name, chance in assessment.present.items() if chance > FOUND}
+    acting = {name: assessment.template(name) for name, chance in there.items() if chance > FOUND}
     for signal in sorted({name for one in protocol.runs for name in one.seen}):
         used = signal not in assessment.set_aside
         found: dict[str, Any] = {

@@ -16,14 +16,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import mujoco
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from openant_tools.effects.effect import Chance, Effect
-from openant_tools.gap.arrivals import LATE_S, natural_modes, step_response
 from openant_tools.gap.protocol import Played
 from openant_tools.model.plant import Plant, Setup
+from openant_tools.model.servo import read_damping, read_stiffness, read_velocity_gain
+from openant_tools.recording.run import Run
 
 __all__ = ["Irregular", "irregular"]
 
@@ -43,6 +45,10 @@ BURSTS = (1, 2, 3, 5, 8, 12)
 PRICE = float(np.log(12) + np.log(len(BURSTS)))
 #: variances of when commands act, s², for one of what else is new, a deviation of which is 1
 RATIOS = np.concatenate([[0.0], np.geomspace(0.0002, 0.08, 24) ** 2])
+#: s by which a command is taken to be late where the direction of that is found
+LATE_S = 0.004
+#: rad/s between which a servo's natural frequency is believed
+NATURAL_RAD_S = (3.0, 600.0)
 #: numbers that only must not be zero
 TINY = 1e-12
 #: deviation of sizes, as a share: commands that hardly move a joint are not found, and servos do not answer as a second-order system does
@@ -146,7 +152,7 @@ def irregular(
         for setup in Setup
     }
     for one, error, plant, delay in zip(runs, errors, plants, delays, strict=True):
-        modes = natural_modes(one.run, plant)
+        modes = _natural_modes(one.run, plant)
         for window in one.windows or [(float(one.run.t[0]), float(one.run.t[-1]) + 1.0)]:
             answers = [
                 _answers(one, j, error[:, j], window, delay[j], modes[0][j], modes[1][j], usual[one.plant.setup][j])
@@ -216,7 +222,7 @@ def _answers(
     since = t[rows, None] - np.maximum(acts, t[rows[0]])
     until = t[rows, None] - np.append(acts[1:], np.inf)
     whole, ended, after = (
-        step_response(np.maximum(time, 0.0), natural, damped) for time in (since, until, since - LATE_S)
+        _step_response(np.maximum(time, 0.0), natural, damped) for time in (since, until, since - LATE_S)
     )
     to_offset = whole - ended
     to_delay = (after - whole) / LATE_S * np.diff(values, prepend=values[0])
@@ -281,3 +287,27 @@ def _scattered(group: Sequence[_Answers]) -> tuple[Array, Array, int]:
     whole = sum(float(some.new @ some.new) for some in group)
     left = whole - (RATIOS[:, None] / grows * along).sum(axis=1)
     return np.log(grows).sum(axis=1), left, sum(len(some.new) for some in group)
+
+
+def _natural_modes(run: Run, plant: Plant) -> tuple[Array, Array]:
+    """(joints,) natural frequencies, rad/s, and damping ratios of a model's servos where a run begins."""
+    model, data = plant.model, mujoco.MjData(plant.model)
+    data.qpos[plant.qpos] = np.nan_to_num(run.signal("pos", plant.joints)[0])
+    mujoco.mj_forward(model, data)
+    inertia = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, inertia)
+    own = np.maximum(inertia[plant.dof, plant.dof], 1e-9)
+    joints = range(len(plant.joints))
+    stiffness = np.array([max(read_stiffness(model, plant, j), 1e-9) for j in joints])
+    damping = np.array([read_damping(model, plant, j) + read_velocity_gain(model, plant, j) for j in joints])
+    return np.clip(np.sqrt(stiffness / own), *NATURAL_RAD_S), damping / (2 * np.sqrt(stiffness * own))
+
+
+def _step_response(t: Array, natural: float, damped: float) -> Array:
+    """Of a second-order system, the share of a step that it has gone t after it."""
+    root = np.sqrt(complex(damped**2 - 1))
+    if abs(root) < 1e-3:
+        root = complex(1e-3)
+    slow, fast = natural * (damped - root), natural * (damped + root)
+    out: Array = np.real(1 - (fast * np.exp(-slow * t) - slow * np.exp(-fast * t)) / (fast - slow))
+    return out

@@ -7,7 +7,7 @@ import hashlib
 import json
 import math
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,19 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.effects.robot import Reference, Robot, Seen
-from openant_tools.gap.arrivals import Arrivals
-from openant_tools.gap.features import (
-    ARRIVAL,
-    COLUMNS,
-    IMU_DELAY,
-    LATENESS,
-    SKIP_S,
-    Floats,
-    Layout,
-    around_switching,
-    logged,
-)
-from openant_tools.gap.imu_delay import ImuDelay
+from openant_tools.gap.features import COLUMNS, Floats, Layout, around_switching, logged
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.floor import resolution
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
@@ -103,19 +91,14 @@ class Played:
         t = self.run.t - self.run.t[0]
         return Layout(
             t, self.plant.setup, len(self.plant.joints), self.signals, self.run.duration_s,
-            around_switching(self.run, self.plant.joints), Arrivals.of(self.run, self.plant, t >= SKIP_S),
-            ImuDelay.of(t) if "gyro" in self.signals else None,
+            around_switching(self.run, self.plant.joints),
         )  # fmt: skip
 
-    def features(self, nominal: Mapping[str, Floats]) -> tuple[Floats, NDArray[np.bool_]]:
-        """(features,) of the run itself against what the model does, and which of them its log has."""
+    def features(self, nominal: Mapping[str, Floats]) -> Floats:
+        """(features,) of the run itself against what the model does."""
         seen = {name: self.seen.get(name, nominal[name]) for name in self.signals}
-        return self.layout.features(seen, nominal)[0], self.there(self.seen)
-
-    def there(self, seen: Collection[str]) -> NDArray[np.bool_]:
-        """(features,) which of them a log of these signals has."""
-        groups = self.layout.groups()
-        return np.concatenate([np.full(len(groups[name]), _read_from(name) in seen) for name in groups])
+        found: Floats = self.layout.features(seen, nominal)[0]
+        return found
 
 
 def rollouts_of(runs: Sequence[Played], nthread: int = 0) -> Rollouts:
@@ -242,10 +225,6 @@ class RunSet:
         """Of each run, what the model (or another robot) does with its commands from its start on, at its own rows."""
         return Players.of(self.runs).play([robot or Robot(len(self.joints))])
 
-    def features(self, robot: Robot | None = None) -> list[tuple[Floats, NDArray[np.bool_]]]:
-        """Of each run, its features against the model (or another robot) and which of them its log has."""
-        return [one.features(nominal) for one, nominal in zip(self.runs, self.nominal(robot), strict=True)]
-
     def fingerprint(self) -> str:
         """Of what decides the simulations but for the runs themselves: model and joints."""
         state = hashlib.sha256()
@@ -253,11 +232,6 @@ class RunSet:
             state.update(path.read_bytes())
         state.update(json.dumps(list(self.joints)).encode())
         return state.hexdigest()[:16]
-
-
-def _read_from(signal: str) -> str:
-    """The signal that features are of: how late rows and commands are is read from positions, how late a body is where it turns."""
-    return "pos" if signal in (LATENESS, ARRIVAL) else "gyro" if signal == IMU_DELAY else signal
 
 
 def alike(one: Run, other: Run, joints: Sequence[str]) -> bool:

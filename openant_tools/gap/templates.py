@@ -6,7 +6,7 @@ place is taken out shows the next one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -36,36 +36,25 @@ class Templates:
     """Templates in the measure of healthy robots.
 
     Attributes:
-        bank: what each is of. vectors: (templates, features). joints: how many the robot has.
+        bank: what each is of. vectors: (templates, features).
     """
 
     bank: tuple[Template, ...]
     vectors: Floats
-    joints: int
 
     @classmethod
-    def of(cls, bank: Sequence[Template], vectors: Floats, joints: int) -> Templates:
+    def of(cls, bank: Sequence[Template], vectors: Floats) -> Templates:
         """Those that show at all."""
         seen = np.linalg.norm(vectors, axis=1) > SHOWS
-        return cls(tuple(one for one, shows in zip(bank, seen, strict=True) if shows), vectors[seen], joints)
+        return cls(tuple(one for one, shows in zip(bank, seen, strict=True) if shows), vectors[seen])
 
     @cached_property
     def causes(self) -> tuple[str, ...]:
         return tuple(sorted({name for name, _, _ in self.bank}))
 
-    def __reduce__(self) -> tuple[object, ...]:
-        # What follows from the vectors need not be stored beside them.
-        return Templates, (self.bank, self.vectors, self.joints)
-
     @cached_property
     def _unit(self) -> Floats:
         out: Floats = self.vectors / np.maximum(np.linalg.norm(self.vectors, axis=1, keepdims=True), FITS)
-        return out
-
-    @cached_property
-    def _alike(self) -> Floats:
-        """(templates, templates) cosines."""
-        out: Floats = self._unit @ self._unit.T
         return out
 
     @cached_property
@@ -81,17 +70,9 @@ class Templates:
             groups.setdefault((name, where), []).append(k)
         return [np.array(groups[name, where]) for name, where, _ in self.bank]
 
-    def fits(self, z: Floats, some: Bools | None = None) -> Floats:
-        """(robots, templates) how far whitened differences go along each template, none backwards.
-
-        Args:
-            some: (features,) only by these; default all.
-        """
-        unit = self._unit
-        if some is not None:
-            z, part = z[:, some], self.vectors[:, some]
-            unit = part / np.maximum(np.linalg.norm(part, axis=1, keepdims=True), FITS)
-        out: Floats = np.maximum(z @ unit.T, 0.0)
+    def fits(self, z: Floats) -> Floats:
+        """(robots, templates) how far whitened differences go along each template, none backwards."""
+        out: Floats = np.maximum(z @ self._unit.T, 0.0)
         return out
 
     def without_best(self, z: Floats, times: int) -> Floats:
@@ -102,29 +83,3 @@ class Templates:
             unit = self._unit[mine].astype(np.float64)
             left = left - np.linalg.solve(unit @ unit.T + NOISE * np.eye(len(mine)), unit @ left) @ unit
         return left.astype(np.float32)
-
-    def by_cause(self, fit: Floats) -> Floats:
-        """(robots, causes) the best fit of each."""
-        return np.stack([fit[:, some].max(axis=1) for some in self.of_cause], axis=1)
-
-    def by_joint(self, fit: Floats) -> Floats:
-        """(robots, joints) the best fit of any cause that sits there alone."""
-        single = np.array([where[0] if len(where) == 1 else -1 for _, where, _ in self.bank])
-        return np.stack([fit[:, single == j].max(axis=1, initial=0.0) for j in range(self.joints)], axis=1)
-
-    def peeled(self, z: Floats, times: int) -> Iterator[tuple[Floats, Floats]]:
-        """What is left once the best cause at its place is taken out, then the next, and so on (matching pursuit).
-
-        Yields:
-            so many times: (robots, causes) the best fit of each to what is left; (robots, 1) how large that is.
-        """
-        along, size = (z @ self._unit.T).astype(np.float64), np.square(z, dtype=np.float64).sum(axis=1)
-        for _ in range(times):
-            for r, best in enumerate(along.argmax(axis=1)):
-                mine = self._same_place[int(best)]
-                alike = self._alike[np.ix_(mine, mine)] + NOISE * np.eye(len(mine))
-                share = np.linalg.solve(alike, along[r, mine])
-                size[r] -= share @ along[r, mine]
-                along[r] -= share @ self._alike[mine]
-            left = np.sqrt(np.maximum(size, TINY))[:, None].astype(np.float32)
-            yield self.by_cause(np.maximum(along, 0.0).astype(np.float32)), left

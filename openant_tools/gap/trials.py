@@ -28,7 +28,7 @@ class Trials:
 
     Attributes:
         closures: causes → what they close; of none at all what a re-fit within tolerance does by itself.
-        starts: causes → where their first steps have led.
+        starts: causes → where their first steps have led. along: several causes → how far what the others leave goes along the last one.
     """
 
     experiment: Experiment
@@ -36,6 +36,7 @@ class Trials:
     fits: Fits
     closures: dict[Causes, Closure] = field(default_factory=dict)
     starts: dict[Causes, Refit] = field(default_factory=dict)
+    along: dict[Causes, float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, experiment: Experiment, assessment: Assessment) -> Trials:
@@ -72,19 +73,20 @@ class Trials:
                 found[causes[-1]] = likelihood - known.likelihood
         return found
 
-    def row(self, causes: Causes, probability: float) -> Row:
+    def row(self, causes: Causes) -> Row:
         """What is known of the last of some causes, beside the others."""
         where = {part.cause: part.joints for part in self._start(_simulated(causes)).hypothesis}
         places = tuple(where.get(name) or self.assessment.place(name) for name in causes)
+        fit = self.along[causes] if len(causes) > 1 else self.assessment.fit[causes[0]]
         if catalogue()[causes[-1]].random:
             at = self.closures[_simulated(causes)].irregular.joints(catalogue()[causes[-1]])
-            return Row(causes, (*places[:-1], at), probability, irregular=self._irregular(causes))
+            return Row(causes, (*places[:-1], at), fit, irregular=self._irregular(causes))
         one, other = self.closures.get(causes), self.closures.get(causes[:-1])
         if one is None or other is None or not self.tells(causes[-1]):
-            return Row(causes, places, probability)
+            return Row(causes, places, fit)
         return Row(
-            causes, places, probability, one.support(other), one.foretold, one.uneven, one.likelier(other),
-            one.within - other.likelihood, one.closed - other.closed,
+            causes, places, fit, support=one.support(other), foretold=one.foretold, uneven=one.uneven,
+            likelier=one.likelier(other), within=one.within - other.likelihood, gain=one.closed - other.closed,
         )  # fmt: skip
 
     def _irregular(self, causes: Causes) -> float:
@@ -114,7 +116,7 @@ class Trials:
 
     def none(self) -> Row:
         """What is known of no cause at all."""
-        return Row((), probability=self.assessment.none, uneven=self.closures[()].uneven)
+        return Row((), uneven=self.closures[()].uneven)
 
     def removal(self, causes: Causes) -> dict[str, float]:
         """Of causes together, what closes less without each, the most first; of those that were tried without it."""
@@ -129,16 +131,17 @@ class Trials:
     def size(self, name: str) -> Mapping[str, float]:
         """How large a cause would be by its best template's amplitude: where fits start from."""
         evidence = self.assessment.evidence
-        amplitude = float(evidence.amplitudes[0, evidence.causes.index(name)])
+        amplitude = float(evidence.amplitudes[evidence.causes.index(name)])
         return sized(name, self.assessment.template(name), amplitude)
 
     def further(self, causes: Causes) -> list[Causes]:
         """Those with one cause more, by what they leave of the recording: the best fit first, where and as large as it is there."""
         known = self.closures[_simulated(causes)].refit
         out = []
-        for part, x in self.assessment.further(known):
+        for part, x, fit in self.assessment.further(known):
             if part.cause not in causes:
                 out.append((*causes, part.cause))
+                self.along[out[-1]] = fit
                 start = Refit((*known.hypothesis, part), (*known.x, x), known.nuisance)
                 self.starts.setdefault(_simulated(out[-1]), start)
         return out

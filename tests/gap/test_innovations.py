@@ -1,4 +1,4 @@
-"""When commands arrived, as the joints of a simulated Ant show it."""
+"""Which commands were lost, or came at random times, by what a fit leaves of a simulated Ant."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import pytest
 
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.robot import Form, Robot
-from openant_tools.gap.arrivals import Arrivals
 from openant_tools.gap.innovations import Irregular, irregular
 from openant_tools.gap.protocol import Played
 from openant_tools.gap.simulation import simulate
@@ -40,14 +39,6 @@ def run(plant: Plant) -> Run:
     return Run("motion", Facts(tuple(JOINTS), setup="stand"), t, columns)
 
 
-def shown(run: Run, plant: Plant, *robots: Robot, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What `Arrivals` says of robots beside the model."""
-    simulated = simulate(Rollouts(plant, [run]), [Robot(len(JOINTS)), *robots], seed=3, signals=("pos",)).signals["pos"]
-    off = simulated[1:] - simulated[:1]
-    off = off + (noise * np.random.default_rng(8).standard_normal(off.shape)).astype(np.float32)
-    return Arrivals.of(run, plant, run.t >= 0.5)(off, simulated[0])
-
-
 def late(std_s: float, *, one_packet: bool = True) -> Robot:
     robot = Robot(len(JOINTS))
     robot.jitter_s, robot.form = std_s, Form(one_packet=one_packet)
@@ -58,50 +49,6 @@ def losing(fraction: float) -> Robot:
     robot = Robot(len(JOINTS))
     robot.dropout, robot.longest_s, robot.shared_dropout = np.full(len(JOINTS), fraction), 0.04, True
     return robot
-
-
-@pytest.mark.parametrize("std_s", [0.003, 0.006])
-def test_by_how_much_commands_scatter(run: Run, plant: Plant, std_s: float) -> None:
-    size, _, _ = shown(run, plant, late(std_s))
-    assert 0.6 * std_s < 10 ** size[0, -1] < 1.4 * std_s
-
-
-def test_a_servo_within_its_tolerances_is_not_late(run: Run, plant: Plant) -> None:
-    robot = Robot(len(JOINTS))
-    robot.scale["stiffness"], robot.scale["damping"] = np.full(len(JOINTS), 0.9), np.full(len(JOINTS), 1.2)
-    robot.delay = np.full(len(JOINTS), 0.004)
-    size, _, _ = shown(run, plant, robot)
-    assert 10 ** size[0, -1] < 0.0012
-
-
-def test_joints_of_one_packet_are_late_together(run: Run, plant: Plant) -> None:
-    _, _, shared = shown(run, plant, late(0.006), late(0.006, one_packet=False))
-    assert shared[0, 0] > 2 > 0.5 > abs(shared[1, 0])
-
-
-def test_lost_commands_are_late_and_never_early(run: Run, plant: Plant) -> None:
-    _, skew, _ = shown(run, plant, losing(0.1), late(0.006), noise=3e-4)
-    assert skew[0, -1] > 0.6
-    assert abs(skew[1, -1]) < 0.3
-
-
-def test_one_servo_that_loses_its_commands_stands_out(run: Run, plant: Plant) -> None:
-    robot = losing(0.0)
-    robot.dropout[2], robot.shared_dropout = 0.1, False
-    size, _, _ = shown(run, plant, robot, noise=3e-4)
-    assert np.argmax(size[0, :-1]) == 2
-
-
-def test_rows_that_nobody_measured_and_joints_without_commands_say_nothing(run: Run, plant: Plant) -> None:
-    columns = {**run.columns, f"cmd.{plant.joints[1]}": np.full(ROWS, np.nan)}
-    arrivals = Arrivals.of(Run("motion", run.facts, run.t, columns), plant, run.t >= 0.5)
-    off = np.random.default_rng(1).normal(0, 1e-3, (2, ROWS, len(JOINTS))).astype(np.float32)
-    off[:, 100:200] = np.nan
-    size, skew, shared = arrivals(off, run.signal("pos", plant.joints).astype(np.float32))
-    assert np.isfinite(size).all()
-    assert (size[:, 1] < -4).all()
-    assert skew[:, 1] == pytest.approx(0.0)
-    assert np.abs(shared).max() < 0.3, "noise is no packet"
 
 
 LOST, SCATTERED = catalogue()["command_dropout"], catalogue()["clock_jitter"]
