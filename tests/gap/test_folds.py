@@ -58,7 +58,8 @@ def test_two_causes_that_act_beside_each_other_are_both_found(tmp_path: Path) ->
     closed = {causes: one.closed for causes, one in trials.closures.items()}
     assert closed[both] > 0.6
     assert all(closed[one] < closed[both] - 0.1 for one in (both[:1], both[1:]))
-    row = trials.row(both, 0.3)
+    trials.further(both[:1])
+    row = trials.row(both)
     assert row.support is not None
     assert row.support > 0, "what it closes on held-out parts speaks for the second"
     assert min(trials.removal(both).values()) > 0.1
