@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -26,6 +26,7 @@ from openant_tools.gap.features import Floats
 from openant_tools.gap.hypothesis import Part, Refit, sized
 from openant_tools.gap.population import Case
 from openant_tools.gap.protocol import RunSet
+from openant_tools.gap.refine import refined
 from openant_tools.gap.templates import Template
 from openant_tools.model.plant import Setup
 from openant_tools.workers import tied
@@ -116,6 +117,14 @@ def assess(
     seen = np.concatenate([one.features(there) for one, there in zip(coarse.runs, nominal, strict=True)])
     known = np.concatenate([one.layout.known(one.seen) for one in coarse.runs])
     set_aside: dict[str, float] = {}
+
+    def refined_with(known: Bools, cases: list[Case], features: Floats) -> tuple[list[Case], Floats]:
+        progress(0.9, "what the likeliest causes do at their best sizes")
+        scale = Scale.of(layouts, known, healthy[:MEASURE], features, cases, coarse.reference)
+        more, found = refined(scale, seen, lambda cases: _more(coarse, name, cases, jobs))
+        return [*cases, *more], np.concatenate([features, found])
+
+    bank, templates = refined_with(known, bank, templates)
     while True:
         scale = Scale.of(layouts, known, healthy[:MEASURE], templates, bank, coarse.reference)
         beyond = unknown_signals(scale, healthy[MEASURE:], seen)
@@ -124,6 +133,9 @@ def assess(
         worst = max(beyond, key=lambda name: beyond[name])
         set_aside[worst] = beyond[worst]
         known = known & (layouts.signal != worst)
+    if set_aside:  # what they said had a part in the sizes
+        bank, templates = refined_with(known, bank, templates)
+        scale = Scale.of(layouts, known, healthy[:MEASURE], templates, bank, coarse.reference)
     evidence = evidence_of(scale, seen)
     progress(1.0, "evidence")
     far = Anomaly(evidence.size, evidence.left)
@@ -144,9 +156,7 @@ def _simulated(
     """(templates, features) and (healthy robots, features), of all runs side by side."""
 
     def make() -> dict[str, Floats]:
-        # As many parts on any computer, so that they come to the same.
-        step = -(-len(bank) // PARTS)
-        work = [joblib.delayed(tied(templates_at))(protocol, bank[n : n + step]) for n in range(0, len(bank), step)]
+        work = _of_templates(protocol, bank)
         parts = len(work)
         healthy = [Case({}, seed) for seed in range(MEASURE + OTHERS)]
         work += [
@@ -160,6 +170,23 @@ def _simulated(
 
     stored = _cached(name, make)
     return stored["templates"], stored["healthy"]
+
+
+def _more(protocol: RunSet, name: str, cases: Sequence[Case], jobs: int) -> Floats:
+    """(cases, features) of more templates."""
+
+    def make() -> dict[str, Floats]:
+        done = joblib.Parallel(n_jobs=jobs)(_of_templates(protocol, cases))
+        return {"templates": np.concatenate([np.concatenate(part, axis=1) for part in done])}
+
+    asked = hashlib.sha256(json.dumps([list(case.causes.items()) for case in cases]).encode()).hexdigest()
+    return _cached(f"{name}-{asked[:12]}", make)["templates"]
+
+
+def _of_templates(protocol: RunSet, cases: Sequence[Case]) -> list[object]:
+    # As many parts on any computer, so that they come to the same.
+    step = -(-len(cases) // PARTS)
+    return [joblib.delayed(tied(templates_at))(protocol, cases[n : n + step]) for n in range(0, len(cases), step)]
 
 
 def _cached(name: str, make: Callable[[], dict[str, Floats]]) -> Mapping[str, Floats]:
