@@ -86,12 +86,9 @@ def finding(trials: Trials, given: Given, tried: Tried, decision: Decision, chos
     elif decision.verdict == UNEXPLAINED:
         closest = trials.closures.get((decision.likeliest,), plain)
         rest = residual_after(predictions, closest.refit, judged, measured)[0]
-    there = _there(trials, tried, chosen)
+    there = _there(trials, tried, decision, chosen)
     effects = sorted(
-        (
-            _found(trials, row, best, max(decision.chances[row.causes[0]], there[row.causes[0]]))
-            for row in tried.singles
-        ),
+        (_found(trials, row, best, there[row.causes[0]]) for row in tried.singles),
         key=lambda one: -_rank(one, decision, chosen),
     )
     return Diagnosis(
@@ -130,12 +127,11 @@ def _row(row: Row) -> dict[str, Any]:
     return kept
 
 
-def _there(trials: Trials, tried: Tried, chosen: tuple[str, ...]) -> dict[str, float]:
-    """Cause → how likely it is there beside what is chosen, whatever leads."""
+def _there(trials: Trials, tried: Tried, decision: Decision, chosen: tuple[str, ...]) -> dict[str, float]:
+    """Cause → how likely it is there: that it leads, or that it is beside what is chosen, whichever is more."""
     known = trials.closures.get(chosen, trials.closures[()]).refit
-    return {part.cause: presence(fit, weights()) for part, _, fit in trials.assessment.further(known)} | dict(
-        tried.there
-    )
+    beside = {part.cause: presence(fit, weights()) for part, _, fit in trials.assessment.further(known)}
+    return {name: max(decision.chances[name], tried.there.get(name, by)) for name, by in beside.items()}
 
 
 def _rank(one: Found, decision: Decision, chosen: Sequence[str]) -> float:
