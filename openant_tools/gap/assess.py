@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from openant_tools.arrays import read_arrays, write_arrays
 from openant_tools.errors import BadInput
 from openant_tools.gap.cache import cache_folder, keep_small
-from openant_tools.gap.decide import Anomaly
 from openant_tools.gap.ensemble import robots_at, templates_at, templates_of
 from openant_tools.gap.evidence import Evidence, Layouts, Scale, anomalies, evidence_of, unknown_signals
 from openant_tools.gap.features import Floats
@@ -48,14 +47,13 @@ class Assessment:
     """What is known of a recording before anything is fitted.
 
     Attributes:
-        evidence: how far it goes along each cause. anomaly: how far it is from the model.
+        evidence: how far it goes along each cause, and how far it is from the model.
         set_aside: signal → times the farthest healthy robot by which it behaves as none that is known: it had no part in this.
         anomalies: signal → how far it is from the model's, in what healthy robots are off by: above 1 beyond nearly all of them.
         protocol: the recording as it was simulated for that. scale: what it was measured by. seen: (features,) of the recording.
     """
 
     evidence: Evidence
-    anomaly: Anomaly
     set_aside: Mapping[str, float]
     anomalies: Mapping[str, float]
     protocol: RunSet
@@ -136,10 +134,9 @@ def assess(
     if set_aside:  # what they said had a part in the sizes
         bank, templates = refined_with(known, bank, templates)
         scale = Scale.of(layouts, known, healthy[:MEASURE], templates, bank, coarse.reference)
-    evidence = evidence_of(scale, seen)
     progress(1.0, "evidence")
-    far = Anomaly(evidence.size, evidence.left)
-    return Assessment(evidence, far, set_aside, anomalies(scale, healthy[MEASURE:], seen), coarse, scale, seen)
+    far = anomalies(scale, healthy[MEASURE:], seen)
+    return Assessment(evidence_of(scale, seen), set_aside, far, coarse, scale, seen)
 
 
 def layouts_of(protocol: RunSet) -> Layouts:

@@ -80,7 +80,7 @@ def diagnose(
     experiment = Experiment.of(sorted(runs, key=_content), model, wanted, sorted(hold_out, key=_content))
     tell(0.02, str(experiment.selection))
     trials, rows = hypotheses(experiment, prior, lambda share, words: tell(0.02 + 0.73 * share, words))
-    decision = decide(rows, trials.assessment.anomaly)
+    decision = decide(rows, trials.assessment.evidence.anomaly)
     # Others are looked for also beside a cause than which something unknown is likelier so far, or another cause as likely.
     chosen = (decision.likeliest,) if decision.verdict == UNEXPLAINED else decision.causes
     declined, there = list[Row](), dict[str, float]()
@@ -100,7 +100,7 @@ def diagnose(
         chosen = more.causes
         rows.append(more)
     # What several causes explain together is not unexplained, and those that are both there are no alternatives.
-    decision = decide(rows, trials.assessment.anomaly)
+    decision = decide(rows, trials.assessment.evidence.anomaly)
     if not set(decision.causes) & set(chosen):
         chosen = decision.causes
     tell(1.0, "decision")

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.effects.robot import Reference
+from openant_tools.gap.decide import Anomaly
 from openant_tools.gap.features import COLUMNS, Floats
 from openant_tools.gap.population import Case
 from openant_tools.gap.templates import Template, Templates
@@ -20,7 +21,6 @@ from openant_tools.gap.whitening import Whitening, whiten
 
 __all__ = ["Evidence", "Layouts", "Scale", "anomalies", "evidence_of", "unknown_signals"]
 
-Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
@@ -55,9 +55,7 @@ class Evidence:
         causes: names, those that can show on this recording.
         fit: (causes,) deviations of healthy robots along the template of each that fits best.
         places: (causes,) that template, an index into `bank`. amplitudes: how many times it; deviations: their standard deviations.
-        size: root mean square of what tolerances leave, 1 where a robot differs as healthy ones do. left: without what the best cause
-            explains at its place.
-        bank: what templates are of.
+        anomaly: how far it is from the model, whatever it goes along. bank: what templates are of.
     """
 
     causes: tuple[str, ...]
@@ -65,8 +63,7 @@ class Evidence:
     places: Ints
     amplitudes: Floats
     deviations: Floats
-    size: float
-    left: float
+    anomaly: Anomaly
     bank: tuple[Template, ...]
 
 
@@ -121,7 +118,7 @@ def evidence_of(scale: Scale, features: Floats) -> Evidence:
     size, left = (float(np.linalg.norm(of)) / root for of in (z[0], t.without_best(z[0], 1)))
     # What the best causes leave is as large as the noise that an amplitude is known by.
     deviations = max(size, 1.0) / length[best]
-    return Evidence(t.causes, fit[best], best, fit[best] / length[best], deviations, size, left, t.bank)
+    return Evidence(t.causes, fit[best], best, fit[best] / length[best], deviations, Anomaly(size, left), t.bank)
 
 
 def anomalies(scale: Scale, healthy: Floats, features: Floats) -> dict[str, float]:

@@ -30,7 +30,6 @@ from openant_tools.recording.run import Run
 __all__ = ["Irregular", "irregular"]
 
 Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 #: rows that predict the next one, and how many of them a joint's prediction is learned from at least

@@ -17,8 +17,6 @@ from openant_tools.gap.features import Floats
 
 __all__ = ["Template", "Templates"]
 
-Bools = NDArray[np.bool_]
-
 #: its cause, where that sits, and its coordinates
 Template = tuple[str, tuple[int, ...], dict[str, float]]
 #: shorter templates do not show
@@ -27,8 +25,6 @@ SHOWS = 1e-3
 NOISE = 1e-3
 #: deviations by which a template has to show, to be fitted as it is: what differs by less is noise along any direction
 FITS = 1.0
-#: numbers that only must not be zero
-TINY = 1e-6
 
 
 @dataclass(frozen=True)

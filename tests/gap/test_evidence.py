@@ -15,6 +15,7 @@ from openant_tools.gap.evidence import Scale, anomalies, evidence_of, unknown_si
 from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.population import Case
 from openant_tools.gap.protocol import RunSet
+from openant_tools.gap.refine import refined
 from openant_tools.recording.run import Facts, Run
 
 PENDULUM = """
@@ -76,6 +77,37 @@ def simulated(pendulum: RunSet) -> tuple[list[Case], NDArray[np.float32], NDArra
     )
 
 
+@pytest.mark.parametrize(("cause", "x"), [("torque_limit", -0.9), ("actuator_lag", 1.0), ("dead_zone", 1.0)])
+def test_a_size_that_no_template_has_is_found_and_explains_the_rest(
+    pendulum: RunSet,
+    simulated: tuple[list[Case], NDArray[np.float32], NDArray[np.float32]],
+    cause: str,
+    x: float,
+) -> None:
+    (first, *others) = catalogue()[cause].quantities
+    truth = {first.name: x * first.large, **{q.name: q.sought()[0] if q.shape else 0.0 for q in others}}
+    seen = _features(templates_at(pendulum, [Case({cause: ((0,), truth)}, -1)]))[0]
+    bank, templates, healthy = simulated
+    known = np.concatenate([one.layout.known(one.seen) for one in pendulum.runs])
+
+    def scale(bank: list[Case], templates: NDArray[np.float32]) -> Scale:
+        return Scale.of(layouts_of(pendulum), known, healthy, templates, bank, pendulum.reference)
+
+    def share(scale: Scale) -> float:
+        """How much of what was seen the cause's best template explains."""
+        z = scale.whitened(seen[None])
+        fit = scale.templates.fits(z)[0][scale.templates.of_cause[scale.templates.causes.index(cause)]]
+        return float(fit.max() / np.linalg.norm(z))
+
+    before = scale(bank, templates)
+    more, found = refined(before, seen, lambda cases: _features(templates_at(pendulum, cases)))
+    after = scale([*bank, *more], np.concatenate([templates, found]))
+    assert share(after) > max(0.97, share(before))
+    name, _, at = after.templates.bank[int(np.argmax(after.templates.fits(after.whitened(seen[None]))[0]))]
+    assert name == cause
+    assert at[first.name] == pytest.approx(truth[first.name], rel=0.15)
+
+
 def test_a_tolerance_takes_what_lies_within_it_and_no_more(
     pendulum: RunSet, simulated: tuple[list[Case], NDArray[np.float32], NDArray[np.float32]]
 ) -> None:
@@ -106,7 +138,7 @@ def test_each_cause_is_among_the_first_by_what_it_would_do_to_this_very_recordin
     scale = Scale.of(layouts, known, healthy, templates, bank, pendulum.reference)
 
     others = [evidence_of(scale, one) for one in _features(robots_at(pendulum, _healthy(pendulum, 20, 500), 2))]
-    assert 0.5 < np.median([one.size for one in others]) < 1.5, "a healthy robot differs as healthy ones do"
+    assert 0.5 < np.median([one.anomaly.size for one in others]) < 1.5, "a healthy robot differs as healthy ones do"
 
     # On a stand nothing tells a late command from a late reading, and little from a lag.
     late = {"action_delay", "sensor_delay", "actuator_lag"}
@@ -120,7 +152,7 @@ def test_each_cause_is_among_the_first_by_what_it_would_do_to_this_very_recordin
         assert sum(bool(alike & some) for some in first) >= 5, (cause, first)
         mine = found[0].causes.index(cause)
         assert np.median([one.fit[mine] for one in found]) > max(one.fit[mine] for one in others), cause
-        assert all(one.left < one.size for one in found), "the best cause explains some of it"
+        assert all(one.anomaly.left < one.anomaly.size for one in found), "the best cause explains some of it"
 
 
 def test_a_signal_in_which_no_robot_differs_says_nothing(pendulum: RunSet) -> None:
