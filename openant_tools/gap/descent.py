@@ -154,9 +154,9 @@ class Descent:
             self, low=np.where(still, self.u, self.low), high=np.where(still, self.u, self.high), bends=self.bends & ~still,
         )  # fmt: skip
 
-    def begin(self) -> None:
-        """Once more, from where it was best."""
-        self.u, self.damping, self.least, self.slopes, self.errors = self.at, 0.0, np.inf, {}, {}
+    def begin(self, slopes: Mapping[int, Floats]) -> None:
+        """Once more, from where it was best, with what slopes are known of some runs."""
+        self.u, self.damping, self.least, self.slopes, self.errors = self.at, 0.0, np.inf, dict(slopes), {}
 
     @property
     def goes_on(self) -> bool:

@@ -31,6 +31,8 @@ LOOKS = 3
 #: times a size by templates that are tried to begin from; steps in which tolerances are moved to each, and that tell which causes are worth
 #: following to their end
 SIZES, FIRST_STEPS = (0.5, 1.0, 2.0), 2
+#: times the size by first steps from which a cause is followed as well
+LARGER = 3.0
 #: how often slopes of tolerances are measured, each time where those before lead no farther
 MEASURED = 3
 #: hypotheses, those that leave least, that go on by slopes which are measured where they have come to
@@ -187,35 +189,37 @@ class Fits:
                 descents[n] = one
 
     def _descend(self, starts: Sequence[Refit], fitted: Sequence[int], base: Hypothesis) -> list[Descent]:
-        """Follow each start to where it leaves least on these runs."""
+        """Follow each start to where it leaves least on these runs; a cause that was never followed from a larger size, too.
+
+        Tolerances have come to where there was none: a small one stays in their hollow where a larger one leaves it.
+        """
         # Slopes cost the most: causes begin with what was learnt of tolerances without them on the floor, where each takes a simulation.
         learnt = {k: slopes for k, slopes in self._slopes(base).items() if k in fitted and self._on_floor(k)}
-        descents = [Descent.of(start, len(self.predictions.names), learnt) for start in starts]
-        begun = descents
-        for n in range(1 if learnt else MEASURED):
-            before = [one.least for one in begun]
-            for one in begun if not learnt else ():
-                one.begin()
-            self._follow(begun, fitted, ITERATIONS)
-            if n == 0 and self._least == np.inf and self._other_form(descents[0], fitted):
-                continue
-            begun = [one for one, cost in zip(begun, before, strict=True) if cost - one.least > 2 * LEAST_GAIN]
-            if not begun:
-                break
-        return descents
+        ways = [[start, *(_larger(start) if start.hypothesis not in {base, *self._learnt} else ())] for start in starts]
+        descents = [[Descent.of(start, len(self.predictions.names), learnt) for start in some] for some in ways]
+        every = [one for some in descents for one in some]
+        self._follow(every, fitted, ITERATIONS)
+        if self._least == np.inf:
+            self._choose_form(every[0], fitted)
+        self._go_on(every, fitted, on_floor=not learnt)
+        return [min(some, key=lambda one: one.least) for some in descents]
 
     def _finish(self, descents: Sequence[Descent], fitted: Sequence[int]) -> list[Descent]:
-        """Follow those that leave least by slopes of tolerances that are learnt where they have come to."""
-        # On the stand slopes cost little: there they were learnt where each had come to.
+        """Follow those that leave least by slopes of tolerances that are learnt where they have come to, on the floor as well."""
         floor = any(self._on_floor(k) for k in fitted)
-        finished = begun = sorted(descents, key=lambda one: one.least)[:FINISHED] if floor else []
+        finished = sorted(descents, key=lambda one: one.least)[:FINISHED] if floor else []
+        self._go_on(finished, fitted, on_floor=True)
+        return finished
+
+    def _go_on(self, descents: Sequence[Descent], fitted: Sequence[int], *, on_floor: bool) -> None:
+        """Follow by slopes that are measured where each has come to, as long as those lead on; `on_floor`: there, too."""
+        begun = list(descents)
         for _ in range(MEASURED - 1):
             before = [one.least for one in begun]
             for one in begun:
-                one.begin()
+                one.begin({} if on_floor else {k: slopes for k, slopes in one.slopes.items() if self._on_floor(k)})
             self._follow(begun, fitted, ITERATIONS)
             begun = [one for one, cost in zip(begun, before, strict=True) if cost - one.least > 2 * LEAST_GAIN]
-        return finished
 
     def _follow(self, descents: Sequence[Descent], fitted: Sequence[int], at_most: int) -> None:
         """Take so many steps, or until none goes on."""
@@ -228,9 +232,9 @@ class Fits:
                 one.u = self._solve(one, list(one.blocks))
             moving = [one for one in moving if one.goes_on]
 
-    def _other_form(self, found: Descent, fitted: Sequence[int]) -> bool:
-        """Go on in the form of simulation that leaves least where a descent is; whether that is another one."""
-        before, left = self.predictions.form, []
+    def _choose_form(self, found: Descent, fitted: Sequence[int]) -> None:
+        """Go on in the form of simulation that leaves least where a descent is."""
+        left = []
         for form in self.predictions.forms:
             self.predictions.form = form
             tried = dataclasses.replace(
@@ -239,7 +243,6 @@ class Fits:
             self._look([tried], fitted)
             left.append(tried.least)
         self.predictions.form = self.predictions.forms[int(np.argmin(left))]
-        return self.predictions.form is not before
 
     def _keep(self, found: Descent) -> None:
         """Remember what was learnt of tolerances."""
@@ -353,8 +356,13 @@ class Fits:
         return out + [members for _, members in used]
 
 
-def _sized(start: Refit) -> list[Refit]:
+def _sized(start: Refit, factors: Sequence[float] = SIZES) -> list[Refit]:
     """A hypothesis with its last cause so many times as large."""
     *others, last = start.x
     cause = start.hypothesis[-1].cause
-    return [dataclasses.replace(start, x=(*others, sized(cause, last, times))) for times in SIZES]
+    return [dataclasses.replace(start, x=(*others, sized(cause, last, times))) for times in factors]
+
+
+def _larger(start: Refit) -> list[Refit]:
+    """A hypothesis with its last cause LARGER times as large, where it is not as large as it may be, nor nothing."""
+    return [one for one in _sized(start, [LARGER]) if one.x != start.x]

@@ -135,6 +135,26 @@ def test_torque_that_goes_a_little_later_than_its_row_is_no_late_sensor(tmp_path
     assert "switching" not in calibration_of(predictions, plain.refit, [0]), "it is none of the robot"
 
 
+@pytest.mark.parametrize("limit", [-0.2, -0.3, -0.4])
+def test_a_cause_is_found_from_a_size_that_does_nothing(limit: float, tmp_path: Path) -> None:
+    """It gives 0.6 N·m of the model's 4: with a little less than 4 none of the motion is another, and no slope says where to go."""
+    robot = mujoco.MjModel.from_xml_string(
+        pendulum(f'<position {SERVO} kp="8" forcerange="-0.6 0.6"/>').replace(BENCH, "")
+    )
+    robot.opt.timestep = 0.0005
+    runs = []
+    for amplitude in (0.4, 0.7):
+        columns = drive(robot, ["joint"], T, amplitude * sweep(T, 1), noise=3e-4, quantum=ENCODER_RAD)
+        runs.append(run_of(columns, T, ["joint"], f"sweep-{amplitude}"))
+    model = write(tmp_path / "given.xml", pendulum(f'<position {SERVO} kp="8" forcerange="-4 4"/>'))
+    fits = Fits(Predictions(RunSet.of(runs, model, ["joint"], [None, None])))
+    start = fits.of([Part("torque_limit", (0,))], [{"limit": limit}])
+    plain, found = closures(fits, [fits.nothing(), start], [(0,), (1,)], [0, 1])
+    assert plain.after > 0.03
+    assert found.after < 0.006
+    assert found.refit.x[0]["limit"] == pytest.approx(math.log(0.6 / 4), abs=0.4)
+
+
 @pytest.mark.parametrize("name", ["actuator_lag", "action_delay", "load_friction", "backlash"])
 def test_a_cause_that_is_not_there_ends_at_nothing_and_not_beyond(name: str, tmp_path: Path) -> None:
     fits = Fits(Predictions(protocol(tmp_path, kp=8.0, dry=0.03)))
