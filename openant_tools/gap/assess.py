@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.arrays import read_arrays, write_arrays
+from openant_tools.effects.robot import Robot
 from openant_tools.errors import BadInput
 from openant_tools.gap.cache import cache_folder, keep_small
-from openant_tools.gap.ensemble import robots_at, templates_at, templates_of
+from openant_tools.gap.ensemble import robot_at, robots_at, templates_at, templates_of
 from openant_tools.gap.evidence import Evidence, Layouts, Scale, anomalies, evidence_of, unknown_signals
 from openant_tools.gap.features import Floats
-from openant_tools.gap.hypothesis import Part, Refit, sized
+from openant_tools.gap.hypothesis import Part, sized
 from openant_tools.gap.population import Case
 from openant_tools.gap.protocol import RunSet
 from openant_tools.gap.refine import refined
@@ -78,14 +79,14 @@ class Assessment:
         """Coordinates of its best template."""
         return self._best(cause)[2]
 
-    def further(self, known: Refit) -> list[tuple[Part, dict[str, float], float]]:
-        """Where every cause would sit, its coordinates, and how far what a robot with causes that were fitted leaves of the recording goes along
-        it, in deviations of healthy robots. The best fit first.
+    def further(self, robots: Sequence[Robot]) -> list[tuple[Part, dict[str, float], float]]:
+        """Where every cause would sit, its coordinates, and how far what a robot leaves of the recording goes along it, in deviations of
+        healthy robots. The best fit first.
+
+        Args:
+            robots: that robot as it was on each run, re-fitted with the causes that are known.
         """
-        parts = zip(known.hypothesis, known.x, strict=True)
-        case = Case({part.cause: (part.joints, dict(x)) for part, x in parts}, -1)
-        robot = np.concatenate(templates_at(self.protocol, [case]), axis=1)
-        left = self.scale.whitened(self.seen[None]) - self.scale.vectors(robot)
+        left = self.scale.whitened((self.seen - robot_at(self.protocol, robots))[None])
         templates = self.scale.templates
         fit, length = templates.fits(left)[0], np.linalg.norm(templates.vectors, axis=1)
         out = []
@@ -99,12 +100,15 @@ class Assessment:
 
 
 def assess(
-    protocol: RunSet, progress: Callable[[float, str], None] = lambda share, words: None, jobs: int = -1
+    protocol: RunSet,
+    progress: Callable[[float, str], None] = lambda share, words: None,
+    jobs: int = -1,
+    without: Collection[str] = (),
 ) -> Assessment:
     """Assess a recording (`Experiment.protocol`).
 
     Args:
-        progress: told a share and words. jobs: processes; none of the result depends on it.
+        progress: told a share and words. jobs: processes; none of the result depends on it. without: signals that have no part in it.
     """
     coarse = protocol.coarse()
     bank = templates_of(coarse)
@@ -114,6 +118,7 @@ def assess(
     nominal = coarse.nominal()
     seen = np.concatenate([one.features(there) for one, there in zip(coarse.runs, nominal, strict=True)])
     known = np.concatenate([one.layout.known(one.seen) for one in coarse.runs])
+    known = known & ~np.isin(layouts.signal, list(without))
     set_aside: dict[str, float] = {}
 
     def refined_with(known: Bools, cases: list[Case], features: Floats) -> tuple[list[Case], Floats]:

@@ -29,7 +29,7 @@ from openant_tools.numbers import number
 from openant_tools.recording.run import Run
 from openant_tools.sysid.identify import joints_in_common
 
-__all__ = ["diagnose", "hypotheses", "prepare"]
+__all__ = ["content", "diagnose", "hypotheses", "prepare"]
 
 Progress = Callable[[float, str], None]
 
@@ -77,7 +77,7 @@ def diagnose(
     wanted = joints_in_common([*runs, *hold_out], model, joints)
     _check_motion([*runs, *hold_out], wanted)
     # In whatever order runs are named, the same robots are simulated for them.
-    experiment = Experiment.of(sorted(runs, key=_content), model, wanted, sorted(hold_out, key=_content))
+    experiment = Experiment.of(sorted(runs, key=content), model, wanted, sorted(hold_out, key=content))
     tell(0.02, str(experiment.selection))
     trials, rows = hypotheses(experiment, prior, lambda share, words: tell(0.02 + 0.73 * share, words))
     decision = decide(rows, trials.assessment.evidence.anomaly)
@@ -138,7 +138,7 @@ def prepare(
     Returns:
         how many robots.
     """
-    experiment = Experiment.of(sorted(runs, key=_content), model, joints_in_common(runs, model, joints))
+    experiment = Experiment.of(sorted(runs, key=content), model, joints_in_common(runs, model, joints))
     return assess(experiment.protocol, progress or (lambda share, words: None)).robots
 
 
@@ -169,7 +169,7 @@ def _check(runs: Sequence[Run], hold_out: Sequence[Run]) -> None:
         raise BadInput("only held-out runs", remedy="name runs to diagnose beside --hold-out")
     for one in hold_out:
         for other in runs:
-            if _content(one) == _content(other):
+            if content(one) == content(other):
                 raise BadInput(
                     f"the held-out run is the same as {other.name}", where=one.path or one.name,
                     remedy="hold out a run that is not diagnosed",
@@ -186,7 +186,8 @@ def _check_prior(prior: Sequence[str]) -> None:
             )
 
 
-def _content(run: Run) -> str:
+def content(run: Run) -> str:
+    """What a run is told by, and sorted by: of its times, commands and positions."""
     state = hashlib.sha256(np.ascontiguousarray(run.t).tobytes())
     for name in sorted(run.columns):
         if name.startswith(("pos.", "cmd.")):

@@ -21,7 +21,7 @@ from openant_tools.gap.sensors import logged_by, widened
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.plant import Setup
 
-__all__ = ["robots_at", "templates_at", "templates_of"]
+__all__ = ["robot_at", "robots_at", "templates_at", "templates_of"]
 
 Ints = NDArray[np.int64]
 
@@ -85,6 +85,16 @@ def templates_at(protocol: RunSet, bank: Sequence[Case]) -> list[Floats]:
                 features[n, mine] = row[mine]
         out.append(_bounded(features))
     return out
+
+
+def robot_at(protocol: RunSet, robots: Sequence[Robot]) -> Floats:
+    """(features,) of all runs side by side: what one robot, as it was on each, does otherwise than the model."""
+    out = []
+    for k, (played, robot) in enumerate(zip(protocol.runs, robots, strict=True)):
+        signals = _simulated(played, [Robot(len(protocol.joints)), robot], seed=k)
+        out.append(played.layout.features(_others(signals), _first(signals)))
+    found: Floats = _bounded(np.concatenate(out, axis=1))[0]
+    return found
 
 
 def robots_at(protocol: RunSet, cases: Sequence[Case], seed: int) -> list[Floats]:

@@ -129,8 +129,8 @@ def _row(row: Row) -> dict[str, Any]:
 
 def _there(trials: Trials, tried: Tried, decision: Decision, chosen: tuple[str, ...]) -> dict[str, float]:
     """Cause → how likely it is there: that it leads, or that it is beside what is chosen, whichever is more."""
-    known = trials.closures.get(chosen, trials.closures[()]).refit
-    beside = {part.cause: presence(fit, weights()) for part, _, fit in trials.assessment.further(known)}
+    known = chosen if chosen in trials.closures else ()
+    beside = {part.cause: presence(fit, weights()) for part, _, fit in trials.left(known)}
     return {name: max(decision.chances[name], tried.there.get(name, by)) for name, by in beside.items()}
 
 

@@ -134,11 +134,19 @@ class Trials:
         amplitude = float(evidence.amplitudes[evidence.causes.index(name)])
         return sized(name, self.assessment.template(name), amplitude)
 
+    def left(self, causes: Causes) -> list[tuple[Part, dict[str, float], float]]:
+        """Where every cause would sit in what these, fitted, leave of the recording, as large as it is there, and in deviations of healthy
+        robots how far that goes along it. The best fit first.
+        """
+        known, runs = self.closures[_simulated(causes)].refit, self.assessment.protocol.runs
+        return self.assessment.further(
+            [self.fits.predictions.robot(known, k, one.warm_c) for k, one in enumerate(runs)]
+        )
+
     def further(self, causes: Causes) -> list[Causes]:
         """Those with one cause more, by what they leave of the recording: the best fit first, where and as large as it is there."""
-        known = self.closures[_simulated(causes)].refit
-        out = []
-        for part, x, fit in self.assessment.further(known):
+        known, out = self.closures[_simulated(causes)].refit, []
+        for part, x, fit in self.left(causes):
             if part.cause not in causes:
                 out.append((*causes, part.cause))
                 self.along[out[-1]] = fit

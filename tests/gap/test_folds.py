@@ -65,6 +65,22 @@ def test_two_causes_that_act_beside_each_other_are_both_found(tmp_path: Path) ->
     assert min(trials.removal(both).values()) > 0.1
 
 
+def test_what_a_large_cause_leaves_once_it_is_fitted_is_none_of_its_like(tmp_path: Path) -> None:
+    """Tolerances do something else to a robot with so much more damping: that must not pass for a second cause."""
+    robot = load_plant(
+        write(tmp_path / "robot.xml", pendulum(joint='damping="0.3" armature="0.007" frictionloss="0.035"'))
+    )
+    t, runs = 2.0 + np.arange(200) / 50, []
+    for name, cmd in (("sweep", 0.8 * sweep(t, 1)), ("other", 0.5 * sweep(t, 1)[::-1])):
+        runs.append(run_of(drive(robot.model, ["joint"], t, cmd, noise=3e-4), t, ["joint"], name))
+    experiment = Experiment.of(runs, write(tmp_path / "given.xml", pendulum()), ["joint"])
+    trials = Trials.of(experiment, assess(experiment.protocol))
+    damping = ("damping_error",)
+    trials.fit([(), damping])
+    assert trials.assessment.fit["damping_error"] > 50
+    assert max(fit for _, _, fit in trials.left(damping)) < 5
+
+
 def test_folds_leave_out_motions_and_settings(tmp_path: Path) -> None:
     first, second, _ = recorded()
     two = Experiment.of([first, second], write(tmp_path / "a.xml", GIVEN), ["joint"])
