@@ -96,15 +96,15 @@ def keep(path: Path, some: Sequence[Judged]) -> None:
 
 def _as_json(one: Judged) -> dict[str, object]:
     rows, declined = (
-        [[*row.causes, *(_short(getattr(row, name)) for name in KEPT)] for row in some]
+        [[*row.causes, *(short(getattr(row, name)) for name in KEPT)] for row in some]
         for some in (one.rows, one.declined)
     )
-    anomaly = [_short(one.anomaly.size), _short(one.anomaly.left)]
+    anomaly = [short(one.anomaly.size), short(one.anomaly.left)]
     kept = {"right": sorted(one.right), "ill": one.ill, "anomaly": anomaly, "rows": rows}
     return kept | ({"declined": declined} if declined else {})
 
 
-def _short(value: float | None) -> float | None:
+def short(value: float | None) -> float | None:
     return None if value is None else float(f"{value:.6g}")
 
 

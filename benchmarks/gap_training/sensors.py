@@ -18,15 +18,13 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from benchmarks.gap_training.decision import Judged
-from openant_tools.blind.by_command import tables_of
-from openant_tools.blind.run import folders_of
+from benchmarks.gap_training.decision import Judged, short
+from openant_tools.blind.run import folders_of, recorded_of
 from openant_tools.files import write_text
 from openant_tools.gap.assess import assess
 from openant_tools.gap.decide import Anomaly
 from openant_tools.gap.diagnose import content
 from openant_tools.gap.experiment import Experiment
-from openant_tools.recording.tables import read_run
 from openant_tools.sysid.identify import joints_in_common
 
 #: what is left out: motor torque, by current or load
@@ -44,19 +42,17 @@ def without(one: Judged, kept: Mapping[str, Any]) -> Judged:
 
 def evidence(robot: Path, model: Path) -> dict[str, Any] | None:
     """Cause → how far a robot's recording goes along it, and how far it is from the model, without the signal; None: it has none."""
-    runs = [read_run(path) for path in tables_of(robot)]
-    named = next((path for run in runs if (path := run.model_path) is not None and path.is_file()), model)
-    runs = sorted(runs, key=content)  # as a diagnosis does, which has prepared it
-    judged = [run for run in runs if run.facts.extra.get("held_out")]
-    used = [run for run in runs if not run.facts.extra.get("held_out")]
-    protocol = Experiment.of(used, named, joints_in_common(runs, named, None), judged).protocol
+    runs, held_out, named = recorded_of(robot, model)
+    joints = joints_in_common([*runs, *held_out], named, None)
+    # Sorted as a diagnosis does, which has prepared it.
+    protocol = Experiment.of(sorted(runs, key=content), named, joints, sorted(held_out, key=content)).protocol
     if not any(SIGNAL in one.seen for one in protocol.runs):
         return None
     with threadpool_limits(1, "blas"):
         found = assess(protocol, without=(SIGNAL,))
-    size, left = found.evidence.anomaly.size, found.evidence.anomaly.left
-    fit = {cause: float(f"{value:.6g}") for cause, value in found.fit.items()}
-    return {"anomaly": [float(f"{size:.6g}"), float(f"{left:.6g}")], "fit": fit}
+    anomaly = found.evidence.anomaly
+    fit = {cause: short(value) for cause, value in found.fit.items()}
+    return {"anomaly": [short(anomaly.size), short(anomaly.left)], "fit": fit}
 
 
 def main() -> None:

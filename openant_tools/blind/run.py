@@ -20,10 +20,11 @@ from openant_tools.blind.by_command import is_made, tables_of
 from openant_tools.blind.draw import BATCH
 from openant_tools.errors import BadInput, OpenAntError
 from openant_tools.files import read_json, read_toml, write_text
+from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run
 from openant_tools.workers import tied
 
-__all__ = ["Backend", "Diagnose", "folders_of", "run_set", "verdict_path"]
+__all__ = ["Backend", "Diagnose", "folders_of", "recorded_of", "run_set", "verdict_path"]
 
 Backend = Literal["loky", "dask", "ray"]
 #: a robot's folder and the model → a diagnosis as JSON
@@ -51,13 +52,18 @@ def diagnose_robot(robot: Path, model: Path) -> dict[str, Any]:
     """The diagnosis of one robot from its tables alone, as JSON (formats, section 2)."""
     from openant_tools.gap.diagnose import diagnose
 
+    runs, held_out, named = recorded_of(robot, model)
+    found: dict[str, Any] = diagnose(runs, named, hold_out=held_out).as_json()
+    return found
+
+
+def recorded_of(robot: Path, model: Path) -> tuple[list[Run], list[Run], Path]:
+    """The runs of one robot, those that its maker held out, and the model that they name; else the set's."""
     runs = [read_run(path) for path in tables_of(robot)]
     # A robot of another program may come with a nominal model of its own.
     named = next((path for run in runs if (path := run.model_path) is not None and path.is_file()), model)
-    kept = [run for run in runs if not run.facts.extra.get("held_out")]
     held_out = [run for run in runs if run.facts.extra.get("held_out")]
-    found: dict[str, Any] = diagnose(kept, named, hold_out=held_out).as_json()
-    return found
+    return [run for run in runs if not run.facts.extra.get("held_out")], held_out, named
 
 
 def run_set(
