@@ -171,14 +171,14 @@ def next_experiment(diagnosis: Path, model: Path | None, json_file: Path | None)
 
 def _print(found: Diagnosis) -> None:
     from openant_tools.gap.diagnosis import UNEXPLAINED
-    from openant_tools.gap.words import rest_words, sentence, sizes, where_words
+    from openant_tools.gap.words import closing, rest_words, sentence, sizes, where_words
 
     click.echo(sentence(found))
     shown = found.effects[:SHOWN]
     wide = max((len(where_words(one.joints)) for one in shown), default=0)
     click.echo(f"{'effect':20} {'where':{wide}}  present  closes  size")
     for one in shown:
-        closed = "–" if one.gap_closed is None else percent(one.gap_closed)
+        closed = "–" if one.gap_closed is None else closing(one.gap_closed)
         mark = "*" if one.effect in found.selected else " "
         click.echo(
             f"{mark}{one.effect:19} {where_words(one.joints):{wide}}  {percent(one.probability):>7}  {closed:>6}  {sizes(one)}"

@@ -8,22 +8,18 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 
 from openant_tools.gap.descent import LEAST_GAIN, Descent
 from openant_tools.gap.features import Floats
 from openant_tools.gap.hypothesis import Hypothesis, Part, Refit, refit_at, sized, sizes, without_last
-from openant_tools.gap.nuisance import TILTS
 from openant_tools.gap.prediction import Predictions
-from openant_tools.gap.protocol import Played
+from openant_tools.gap.solver import Solver
 from openant_tools.model.plant import Setup
 
 __all__ = ["Fit", "Fits"]
 
 Array = NDArray[np.float64]
 
-#: rows (of some tens of milliseconds each) of one window say about as much as one: errors within it go together
-INDEPENDENT_S = 0.1
 #: how often slopes are followed at most
 ITERATIONS = 30
 #: and where a cause is held to what robots of one build differ by, from where it was best
@@ -37,11 +33,6 @@ LARGER = 3.0
 MEASURED = 3
 #: hypotheses, those that leave least, that go on by slopes which are measured where they have come to
 FINISHED = 3
-#: how often errors of each joint in each run are taken to be as large as a step leaves them: no model of a real servo is true, and one
-#: that trusts its sensors follows what no parameter explains, to the ends of all of them
-INFLATIONS = 4
-#: by which bounds are wider than what lies on them
-TINY = 1e-12
 
 
 @dataclass(frozen=True)
@@ -73,6 +64,7 @@ class Fits:
 
     def __init__(self, predictions: Predictions) -> None:
         self.predictions = predictions
+        self.solver = Solver(predictions)
         self._learnt: dict[Hypothesis, dict[int, Floats]] = {}
         self._least = np.inf
         self.found = np.zeros(len(predictions.names))
@@ -97,10 +89,10 @@ class Fits:
         """
         fitted, tolerances, learnt = list(training), len(self.predictions.names), self._slopes(base)
         tried = [[Descent.of(some, tolerances, learnt).of_this_size() for some in _sized(start)] for start in starts]
-        self._follow([one for some in tried for one in some], fitted, FIRST_STEPS)
+        self.solver.follow([one for some in tried for one in some], fitted, FIRST_STEPS)
         best = [min(some, key=lambda one: one.least) for some in tried]
         descents = [Descent.of(refit_at(one.start, one.at), tolerances, learnt) for one in best]
-        self._follow(descents, fitted, FIRST_STEPS)
+        self.solver.follow(descents, fitted, FIRST_STEPS)
         return [(refit_at(one.start, one.at), -0.5 * one.least) for one in descents]
 
     def refit(
@@ -129,8 +121,8 @@ class Fits:
             folds = [[k for k in one.blocks if k not in left] for left in leave_out]
             # Where a fold leads otherwise than all of them together, from where these came to; held back it would not leave there.
             one.damping = 0.0
-            whole_way = self._solve(one, list(one.blocks))
-            each = [np.clip(one.at + self._solve(one, fold) - whole_way, one.low, one.high) for fold in folds]
+            whole_way = self.solver.solve(one, list(one.blocks))
+            each = [np.clip(one.at + self.solver.solve(one, fold) - whole_way, one.low, one.high) for fold in folds]
             whole, parts = refit_at(one.start, one.at), [refit_at(one.start, u) for u in each]
             out.append(Fit(whole, parts, refit_at(one.start, self._deviations(one, parts)).x, -0.5 * one.least, within))
         return out
@@ -153,8 +145,8 @@ class Fits:
         limited = [one.of_one_build() if one.causes else one for one in descents]
         beyond = [one for one in limited if not one.inside]
         for one in beyond:
-            one.u, one.least = self._solve(one, list(one.blocks)), np.inf
-        self._follow(beyond, fitted, LOOKS)
+            one.u, one.least = self.solver.solve(one, list(one.blocks)), np.inf
+        self.solver.follow(beyond, fitted, LOOKS)
         return limited
 
     def _no_worse(self, descents: list[Descent], fitted: Sequence[int]) -> list[Descent]:
@@ -198,7 +190,7 @@ class Fits:
         ways = [[start, *(_larger(start) if start.hypothesis not in {base, *self._learnt} else ())] for start in starts]
         descents = [[Descent.of(start, len(self.predictions.names), learnt) for start in some] for some in ways]
         every = [one for some in descents for one in some]
-        self._follow(every, fitted, ITERATIONS)
+        self.solver.follow(every, fitted, ITERATIONS)
         if self._least == np.inf:
             self._choose_form(every[0], fitted)
         self._go_on(every, fitted, on_floor=not learnt)
@@ -218,19 +210,8 @@ class Fits:
             before = [one.least for one in begun]
             for one in begun:
                 one.begin({} if on_floor else {k: slopes for k, slopes in one.slopes.items() if self._on_floor(k)})
-            self._follow(begun, fitted, ITERATIONS)
+            self.solver.follow(begun, fitted, ITERATIONS)
             begun = [one for one, cost in zip(begun, before, strict=True) if cost - one.least > 2 * LEAST_GAIN]
-
-    def _follow(self, descents: Sequence[Descent], fitted: Sequence[int], at_most: int) -> None:
-        """Take so many steps, or until none goes on."""
-        moving = list(descents)
-        for _ in range(at_most):
-            if not moving:
-                break
-            self._look(moving, fitted)
-            for one in moving:
-                one.u = self._solve(one, list(one.blocks))
-            moving = [one for one in moving if one.goes_on]
 
     def _choose_form(self, found: Descent, fitted: Sequence[int]) -> None:
         """Go on in the form of simulation that leaves least where a descent is."""
@@ -240,7 +221,7 @@ class Fits:
             tried = dataclasses.replace(
                 found, u=found.at, least=np.inf, errors={}, blocks={}, slopes=dict(found.slopes)
             )
-            self._look([tried], fitted)
+            self.solver.look([tried], fitted)
             left.append(tried.least)
         self.predictions.form = self.predictions.forms[int(np.argmin(left))]
 
@@ -257,103 +238,6 @@ class Fits:
 
     def _on_floor(self, k: int) -> bool:
         return self.predictions.protocol.runs[k].plant.setup is Setup.FLOOR
-
-    def _weight(self, k: int) -> Array:
-        """(channels,) that errors of a run are multiplied by: its rows go together."""
-        period = float(np.median(np.diff(self.predictions.protocol.runs[k].run.t)))
-        out: Array = np.sqrt(1 / max(1.0, INDEPENDENT_S / period)) / self.predictions.sigma
-        return out
-
-    def _count(self, k: int) -> Array:
-        """(channels,) how many independent errors the rows of a run are, as weighted."""
-        weight = np.square(self._weight(k) * self.predictions.sigma)
-        count: Array = (np.isfinite(self.predictions.measured[k]) & self.predictions.there[k][:, None]).sum(
-            axis=0
-        ) * weight
-        return count
-
-    def _solve(self, descent: Descent, runs: Sequence[int]) -> Array:
-        """Where the blocks of some runs lead, made where the descent was best."""
-        u, prior, scale = descent.at, descent.prior, descent.scale
-        low, high = descent.low, descent.high
-        within = low - u - TINY, high - u + TINY
-        blocks, found = [descent.blocks[k] for k in runs], u
-        for _ in range(INFLATIONS):
-            more, slope = np.diag(1 / scale**2), (u - prior) / scale**2
-            for block in blocks:
-                own, along = block.weighted(1 / block.inflation(block.left(found - u)))
-                more, slope = more + own, slope + along
-            # What ends at a bound leaves its part to the others: clipped afterwards it would leave it undone.
-            root = np.linalg.cholesky(more + descent.damping * np.diag(np.diag(more)))
-            step = lsq_linear(root.T, -np.linalg.solve(root, slope), bounds=within, method="bvls").x
-            found = np.clip(u + step, low, high)
-        # Rounding leaves 1e-16 of what lies on its bound: a delay of that is none.
-        for bound in (low, high):
-            found = np.where(np.abs(found - bound) < 10 * TINY, bound, found)
-        return found
-
-    def _look(self, descents: Sequence[Descent], fitted: Sequence[int]) -> None:
-        """Simulate runs where descents look next, and what varies there."""
-        found: list[dict[int, Floats]] = [{} for _ in descents]
-        for mine, rollouts in self.predictions.side_by_side(fitted):
-            first = mine[0]
-            columns = [self._columns(first, one) for one in descents]
-            steps = [one.steps_on(self.predictions.protocol.runs[first].plant.setup) for one in descents]
-            robots = [
-                self.predictions.robot(refit_at(one.start, u), first)
-                for one, some, by in zip(descents, columns, steps, strict=True)
-                for u in (one.u, *(one.moved(members, by) for members in some))
-            ]
-            for k, errors in zip(mine, self.predictions.coarse(mine, robots, rollouts), strict=True):
-                weight, at = self._weight(k), 0
-                for one, some, by, seen in zip(descents, columns, steps, found, strict=True):
-                    seen[k] = (np.nan_to_num(errors[at]) * weight).astype(np.float32)
-                    change_by = np.zeros((len(one.u), *seen[k].shape), np.float32)
-                    if k in one.slopes:
-                        change_by[:] = one.slopes[k]
-                    for row, members in enumerate(some, at + 1):
-                        change = np.nan_to_num(errors[row] - errors[at]) * weight
-                        for p, mask in members:
-                            change_by[p] = np.where(mask, change, 0.0) / by[p]
-                    at += 1 + len(some)
-                    one.slopes[k] = change_by
-        for one, seen in zip(descents, found, strict=True):
-            one.told(seen, {k: self._count(k) for k in fitted})
-
-    def _columns(self, k: int, descent: Descent) -> list[list[tuple[int, NDArray[np.bool_]]]]:
-        """What is varied on a run. A joint within tolerance moves little: slopes once known are not looked at again."""
-        columns = self._colours(self.predictions.protocol.runs[k], descent.start)
-        if k not in descent.slopes:
-            return columns
-        return [members for members in columns if descent.bends[members[0][0]]]
-
-    def _colours(self, one: Played, start: Refit) -> list[list[tuple[int, NDArray[np.bool_]]]]:
-        """Coordinates that one simulation can vary, because on the stand legs do not move each other."""
-        everywhere = np.ones(len(self.predictions.sigma), bool)
-        on_stand = one.plant.setup is Setup.STAND
-        out: list[list[tuple[int, NDArray[np.bool_]]]] = []
-        n = 0
-        for part in start.hypothesis:
-            for _ in part.definition.quantities:
-                out.append([(n, everywhere)])
-                n += 1
-        tree = one.plant.tree
-        used: list[tuple[set[int], list[tuple[int, NDArray[np.bool_]]]]] = []
-        for k, nuisance in enumerate(self.predictions.names):
-            mine = {int(tree[j]) for j in nuisance.joints} if on_stand else set(tree.tolist())
-            if not mine:  # of the floor, which does nothing to who hangs on a stand, unless it turns both
-                if nuisance.name not in TILTS:
-                    continue
-                mine = set(tree.tolist())
-            mask = np.concatenate([np.isin(tree, list(mine)), ~on_stand & everywhere[self.predictions.joints :]])
-            for trees, members in used:
-                if not trees & mine:
-                    trees |= mine
-                    members.append((n + k, mask))
-                    break
-            else:
-                used.append((mine, [(n + k, mask)]))
-        return out + [members for _, members in used]
 
 
 def _sized(start: Refit, factors: Sequence[float] = SIZES) -> list[Refit]:

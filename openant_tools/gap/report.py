@@ -20,6 +20,7 @@ from openant_tools.gap.words import (
     LEAST_SHARE,
     SIGNALS,
     closed,
+    closing,
     rest_words,
     restart_words,
     sentence,
@@ -76,7 +77,7 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
             *([KeyFigure("gap after", _error(gap["after"]), "the improved model")] if improved else []),
             KeyFigure("floor", _error(gap["floor"]), "what no model could beat"),
             *(
-                [KeyFigure("closed", percent(share), "of the gap above the floor, on held-out runs")]
+                [KeyFigure("closed", closing(share), "of the gap above the floor, on held-out runs")]
                 if improved
                 else []
             ),
@@ -98,7 +99,7 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
         report.section("Why not something else", open=True).table(
             ["effect", "why not", "where", "how likely", "closes by itself"],
             [
-                [one.effect, standing(found, one), where_words(one.joints), percent(one.probability), _percent(one.gap_closed)]
+                [one.effect, standing(found, one), where_words(one.joints), percent(one.probability), _closing(one.gap_closed)]
                 for one in runners_up
             ],
         )  # fmt: skip
@@ -128,7 +129,7 @@ def _error(rad: float) -> str:
 def _details(report: Report, found: Diagnosis) -> None:
     report.section("Details")
     if found.removal:
-        rows = [[name, percent(value)] for name, value in found.removal.items()]
+        rows = [[name, closing(value)] for name, value in found.removal.items()]
         report.details(
             "What each effect of the improved model is worth", Table(["effect", "closes less without it"], rows)
         )
@@ -142,7 +143,7 @@ def _details(report: Report, found: Diagnosis) -> None:
         Table(
             ["effect", "where", "how likely", "closes by itself", "interval", "size", "MuJoCo carries it"],
             [
-                [one.effect, where_words(one.joints), percent(one.probability, decimals=1), _percent(one.gap_closed),
+                [one.effect, where_words(one.joints), percent(one.probability, decimals=1), _closing(one.gap_closed),
                  _between(one.gap_closed_low, one.gap_closed_high), sizes(one), one.native]
                 for one in found.effects
             ],
@@ -313,9 +314,9 @@ def _joints(words: str | Sequence[str]) -> tuple[str, ...] | str:
     return words if isinstance(words, str) else tuple(words)
 
 
-def _percent(value: float | None) -> str | None:
-    return None if value is None else percent(value)
+def _closing(value: float | None) -> str | None:
+    return None if value is None else closing(value)
 
 
 def _between(low: float | None, high: float | None) -> str | None:
-    return None if low is None or high is None else f"{percent(low)} … {percent(high)}"
+    return None if low is None or high is None else f"{closing(low)} … {closing(high)}"

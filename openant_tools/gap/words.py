@@ -16,6 +16,7 @@ __all__ = [
     "LEAST_SHARE",
     "SIGNALS",
     "closed",
+    "closing",
     "part_words",
     "rest_words",
     "restart_words",
@@ -64,11 +65,11 @@ def sentence(found: Diagnosis) -> str:
         words = f"The gap is real, but these runs cannot tell its causes apart: {candidates} ({sure})."
         if not found.selected:
             return words
-        return f"{words} With {' and '.join(found.selected)} in the model, {percent(closed(found))} of the gap closes on held-out runs."
+        return f"{words} With {' and '.join(found.selected)} in the model, {closing(closed(found))} of the gap closes on held-out runs."
     if found.verdict == UNEXPLAINED:
         best = _closest(found)
         closest = "" if best is None else f"; closest is {best.effect}" + (
-            "" if best.gap_closed is None else f", which closes {percent(best.gap_closed)} of it"
+            "" if best.gap_closed is None else f", which closes {closing(best.gap_closed)} of it"
         )  # fmt: skip
         left = f" {rest_words(found)}" if found.rest else ""
         return f"The gap is real, and nothing known here explains it{closest} ({sure}).{left}"
@@ -76,7 +77,7 @@ def sentence(found: Diagnosis) -> str:
     words = f"{one.effect} ({where_words(one.joints)}): {catalogue()[one.effect].words}"
     beside = [name for name in found.selected if name != found.verdict]
     more = f", with {' and '.join(beside)} beside it" if beside else ""
-    closes = f"closes {percent(closed(found))} of the gap on held-out runs."
+    closes = f"closes {closing(closed(found))} of the gap on held-out runs."
     if catalogue()[one.effect].random and not beside:
         return f"{words} ({sure}). No model repeats that; with what else was fitted within tolerance the improved model {closes}"
     return f"{words}{more} ({sure}). The improved model {closes}"
@@ -118,6 +119,11 @@ def closed(found: Diagnosis) -> float:
     return share if math.isfinite(share) else 0.0
 
 
+def closing(share: float) -> str:
+    """How much of the gap closes, as a share of what is above the floor: where it grows, and near the floor by many times that, nothing."""
+    return "nothing" if share < 0.0 else percent(share)
+
+
 def standing(found: Diagnosis, one: Found) -> str:
     """Why it is in the answer, or not."""
     if one.effect in found.refuted:
@@ -126,14 +132,14 @@ def standing(found: Diagnosis, one: Found) -> str:
         return "closest, and not enough"
     if one.effect in found.selected:
         lost = found.removal.get(one.effect)
-        return "in the improved model" + (f"; without it {percent(lost)} less closes" if lost is not None else "")
+        return "in the improved model" + ("" if lost is None else f"; without it {closing(lost)} less closes")
     if any(one.effect in group for group in found.ambiguous_with):
         return "these runs cannot tell"
     leads = next((other for other in found.effects if other.effect == found.verdict), None)
     if one.gap_closed is not None and leads is not None and leads.gap_closed is not None:
-        return f"{BY_ITSELF} {percent(one.gap_closed)}, but {leads.effect} closes {percent(leads.gap_closed)}"
+        return f"{BY_ITSELF} {closing(one.gap_closed)}, but {leads.effect} closes {closing(leads.gap_closed)}"
     if one.gap_closed is not None:
-        return f"{BY_ITSELF} {percent(one.gap_closed)}, which is not enough"
+        return f"{BY_ITSELF} {closing(one.gap_closed)}, which is not enough"
     return f"of robots whose recordings look like this one, {percent(one.probability)} have it"
 
 

@@ -119,8 +119,8 @@ class RunStretch:
         return {round(min(max(after / h, 0.0), last)): off for after, off in self.torque_off.items()}
 
 
-def _allowed_threads() -> int:
-    """By OMP_NUM_THREADS, which joblib sets where it runs processes side by side: threads of all would wait for each other.
+def allowed_threads() -> int:
+    """How many threads a process may have by OMP_NUM_THREADS, which joblib sets where it runs processes side by side: threads of all would wait for each other.
 
     0 where it says nothing.
     """
@@ -155,7 +155,7 @@ class Rollouts:
         if windows is not None:
             horizon = max((stop - start for own in windows for start, stop in own), default=0.0)
         self.horizon = horizon
-        self.nthread = nthread or _allowed_threads()
+        self._nthread = nthread
         ends = np.cumsum([0, *(len(run.t) for run in runs)])
         self.rows = tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(ends))
         leads = plant if leader is None else replace(plant, model=leader)
@@ -178,6 +178,11 @@ class Rollouts:
             self._disable |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
         #: whoever makes variants of this one's model saves a copy of each
         self.plant = replace(plant, model=self.lean(plant.model))
+
+    @property
+    def nthread(self) -> int:
+        """Threads that it may take in this process; 0 for all cores."""
+        return self._nthread or allowed_threads()
 
     def finer(self, parts: int) -> Rollouts:
         """The same with each step cut into so many; as it is where actuators have delay buffers, whose samples count steps."""

@@ -147,3 +147,18 @@ def test_what_a_signature_refutes_is_not_called_closest() -> None:
     assert "closest is stribeck_friction" in sentence(found)
     assert standing(found, lost) == "refuted: it comes back at the same angles"
     assert standing(found, sticking) == "closest, and not enough"
+
+
+def test_a_gap_that_grows_is_not_said_to_close_by_less_than_nothing() -> None:
+    """Near the floor a gap of 0.3 mrad more is minus three times what was above it."""
+    worse, better = (
+        Found(name, ("knee",), {}, 0.5, share, share - 0.1, share + 0.1, True)
+        for name, share in (("stribeck_friction", -2.9), ("action_delay", 0.4))
+    )
+    found = Diagnosis(
+        "m.xml", ("a", "b"), (), "stribeck_friction", 0.9, (worse, better), ("stribeck_friction",), (), None,
+        {"before": 0.0011, "after": 0.0014, "floor": 0.001}, (), removal={"stribeck_friction": -0.2},
+    )  # fmt: skip
+    assert sentence(found).endswith("closes nothing of the gap on held-out runs.")
+    assert standing(found, worse) == "in the improved model; without it nothing less closes"
+    assert standing(found, better) == "by itself it closes 40 %, but stribeck_friction closes nothing"

@@ -225,7 +225,7 @@ def _when(path: Path) -> str:
 def _page(found: Diagnosis) -> Text:
     """The verdict in the order in which one asks: what, where, which, how far, what next."""
     from openant_tools.gap.regime import Regime
-    from openant_tools.gap.words import SIGNALS, closed, sentence, what_next
+    from openant_tools.gap.words import SIGNALS, closed, closing, sentence, what_next
 
     text = Text.assemble((spelled(sentence(found)), "bold"), "\n")
     text.append("\nWhere\n", "bold")
@@ -241,7 +241,7 @@ def _page(found: Diagnosis) -> Text:
     text.append("\nHow far\n", "bold")
     before, after, floor = (number(float(gap[name]), "rad", name="gap") for name in ("before", "after", "floor"))
     text.append(f" {before} {spelled('→')} {after} of position, floor {floor}\n closed ")
-    text.append_text(_bar(share, GREEN)).append(f" {percent(share):>5} on runs left out\n")
+    text.append_text(_bar(share, GREEN)).append(f" {closing(share):>5} on runs left out\n")
     text.append("\nNext\n", "bold")
     text.append(f" {spelled(what_next(found))}\n")
     for note in found.notes:
@@ -250,7 +250,7 @@ def _page(found: Diagnosis) -> Text:
 
 
 def _candidate(found: Diagnosis, one: Found) -> Text:
-    from openant_tools.gap.words import BY_ITSELF, sizes, standing, where_words
+    from openant_tools.gap.words import BY_ITSELF, closing, sizes, standing, where_words
 
     unsure = any(one.effect in group for group in found.ambiguous_with)
     state: Name = "ok" if one.effect in found.selected else "warn" if unsure else "todo"
@@ -258,7 +258,7 @@ def _candidate(found: Diagnosis, one: Found) -> Text:
     text.append_text(_bar(one.probability, BLUE)).append(f" {percent(one.probability):>5}\n")
     values = sizes(one, interval=False)
     why = standing(found, one)
-    alone = "" if one.gap_closed is None or BY_ITSELF in why else f"{BY_ITSELF} {percent(one.gap_closed)}; "
+    alone = "" if one.gap_closed is None or BY_ITSELF in why else f"{BY_ITSELF} {closing(one.gap_closed)}; "
     text.append(spelled(f"   {where_words(one.joints)}{': ' if values else ''}{values}\n   {alone}{why}\n"))
     return text
 
