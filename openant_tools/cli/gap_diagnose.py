@@ -68,8 +68,8 @@ def diagnose(
       openant gap diagnose walk.mcap --robot my-ant --json gap.json --report gap
       openant gap diagnose a.parquet b.parquet --hold-out c.parquet --model pendulum.xml
 
-    Any recording will do, also a single one of a policy: robots with every cause are simulated for it, which takes about a minute,
-    and seconds where the same recording was diagnosed before. Exit code 0 whatever the verdict.
+    Any recording will do, also a single one of a policy: robots with every cause are simulated for it, which takes a minute or
+    two, and a second where the same was asked before. Exit code 0 whatever the verdict.
     """
     from openant_tools.files import json_text, write_text
     from openant_tools.gap.diagnose import diagnose as diagnosed
@@ -80,7 +80,9 @@ def diagnose(
     everything = checked(everything, given, joints)
     recordings, held_out = everything[: len(fitted)], everything[len(fitted) :]
     with progress_bar("reading", lines=True) as tell:
-        found = diagnosed(recordings, given, hold_out=held_out, joints=joints or None, prior=prior, progress=tell)
+        found = diagnosed(
+            recordings, given, hold_out=held_out, joints=joints or None, prior=prior, recall=True, progress=tell
+        )
         if json_file:
             write_text(json_file, json_text(found.as_json()))
         page = None
@@ -98,7 +100,7 @@ def diagnose(
 @joint_option
 @robot_option
 def prepare(runs: tuple[Path, ...], model: Path | None, joints: tuple[str, ...], robot: Path | None) -> None:
-    """Simulate the robots that a diagnosis of RUNs will be judged by, so that it takes seconds. No verdict depends on it."""
+    """Simulate the robots that a diagnosis of RUNs will be judged by, so that it takes less. No verdict depends on it."""
     from openant_tools.gap.diagnose import prepare as prepared
 
     recordings, given = model_of(read_runs(runs), model, robot)

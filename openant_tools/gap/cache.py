@@ -1,18 +1,24 @@
-"""Where what was simulated for a recording is kept, for nobody but this user, and how it stays small."""
+"""Where what was simulated for a recording, and what was found, is kept, for nobody but this user, and how it stays small."""
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import os
+from importlib.metadata import version
 from pathlib import Path
 
+import openant_tools
 from openant_tools.errors import BadInput
 
-__all__ = ["CACHE_VARIABLE", "cache_folder", "keep_small"]
+__all__ = ["CACHE_VARIABLE", "cache_folder", "code", "keep_small"]
 
 #: the environment variable that names the cache, and how large it may grow
 CACHE_VARIABLE = "OPENANT_CACHE"
 LARGEST_BYTES = 2**30
 PRIVATE = 0o700
+#: packages whose results these are as well
+COMPUTE = ("mujoco", "numpy", "scipy")
 
 
 def cache_folder() -> Path:
@@ -33,6 +39,16 @@ def cache_folder() -> Path:
     folder.mkdir(mode=PRIVATE, parents=True, exist_ok=True)
     folder.chmod(PRIVATE)  # where an older version made it
     return folder
+
+
+@functools.cache
+def code() -> str:
+    """What results follow from beside what they are of: this package, word by word, and those that compute."""
+    root = Path(openant_tools.__file__).parent
+    state = hashlib.sha256(" ".join(map(version, COMPUTE)).encode())
+    for place in sorted([*root.rglob("*.py"), *root.rglob("*.json")]):
+        state.update(place.read_bytes())
+    return state.hexdigest()
 
 
 def _user() -> int:

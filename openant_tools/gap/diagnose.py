@@ -14,14 +14,17 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.errors import BadInput
+from openant_tools.files import json_text, write_text
 from openant_tools.gap.assess import Assessment, assess
+from openant_tools.gap.cache import cache_folder, code, keep_small
 from openant_tools.gap.decide import PRESENT, Row, decide, present, weights, worth_fitting
-from openant_tools.gap.diagnosis import UNEXPLAINED, Diagnosis
+from openant_tools.gap.diagnosis import UNEXPLAINED, Diagnosis, read_diagnosis
 from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.finding import Given, Tried, finding
 from openant_tools.gap.trials import Trials
@@ -58,6 +61,7 @@ def diagnose(
     hold_out: Sequence[Run] = (),
     joints: Sequence[str] | None = None,
     prior: Sequence[str] = (),
+    recall: bool = False,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Diagnose the gap between a robot and its model.
@@ -66,6 +70,7 @@ def diagnose(
         runs: recordings of one robot. hold_out: recordings to judge on; without them parts of the runs are left out in turn.
         joints: default every position servo of the model that all runs command and measure.
         prior: effects that are known or expected of this robot: where the runs cannot tell causes apart, they do.
+        recall: whether to answer as before, where this code was asked the same before, and to keep the answer for that.
         progress: told a share and words.
 
     Raises:
@@ -79,6 +84,10 @@ def diagnose(
     # In whatever order runs are named, the same robots are simulated for them.
     experiment = Experiment.of(sorted(runs, key=content), model, wanted, sorted(hold_out, key=content))
     tell(0.02, str(experiment.selection))
+    if recall:
+        place = cache_folder() / f"diagnosis-{_asked(experiment, model, runs, hold_out, prior)}.json"
+        with contextlib.suppress(BadInput):  # not there, cut or another's: it is made anew
+            return read_diagnosis(place)
     trials, rows = hypotheses(experiment, prior, lambda share, words: tell(0.02 + 0.73 * share, words))
     decision = decide(rows, trials.assessment.evidence.anomaly)
     # Others are looked for also beside a cause than which something unknown is likelier so far, or another cause as likely.
@@ -105,7 +114,11 @@ def diagnose(
         chosen = decision.causes
     tell(1.0, "decision")
     given = Given(model, tuple(runs), tuple(hold_out), tuple(prior))
-    return finding(trials, given, Tried(rows, declined, there), decision, chosen)
+    found = finding(trials, given, Tried(rows, declined, there), decision, chosen)
+    if recall:
+        write_text(place, json_text(found.as_json()))
+        keep_small(place)
+    return found
 
 
 def hypotheses(experiment: Experiment, prior: Sequence[str], progress: Progress) -> tuple[Trials, list[Row]]:
@@ -133,7 +146,7 @@ def hypotheses(experiment: Experiment, prior: Sequence[str], progress: Progress)
 def prepare(
     runs: Sequence[Run], model: Path, joints: Sequence[str] | None = None, progress: Progress | None = None
 ) -> int:
-    """Simulate what a diagnosis of these runs will be judged by, so that it takes seconds; no verdict depends on it.
+    """Simulate what a diagnosis of these runs will be judged by, so that it takes less; no verdict depends on it.
 
     Returns:
         how many robots.
@@ -184,6 +197,25 @@ def _check_prior(prior: Sequence[str]) -> None:
                 f"there is no effect {name!r}",
                 remedy=f"did you mean {near[0]!r}?" if near else f"name one of: {', '.join(sorted(catalogue()))}",
             )
+
+
+def _asked(
+    experiment: Experiment, model: Path, runs: Sequence[Run], hold_out: Sequence[Run], prior: Sequence[str]
+) -> str:
+    """What a diagnosis follows from: the code, models as they are compiled, joints, all that runs hold, and what is expected."""
+    state = hashlib.sha256(f"{code()} {model} {experiment.parts.joints} {list(prior)}".encode())
+    for part in experiment.parts.runs:
+        compiled = np.empty(mujoco.mj_sizeModel(part.plant.model), np.uint8)
+        mujoco.mj_saveModel(part.plant.model, None, compiled)
+        state.update(compiled.tobytes())
+    for words, some in (("runs", runs), ("held out", hold_out)):
+        for run in some:
+            state.update(f"{words} {run.name} {run.path} {run.facts}".encode())
+            for name, values in [("t", run.t), *sorted(run.columns.items())]:
+                plain = values if values.dtype.kind in "fiub" else values.astype(str)
+                state.update(f"{name} {plain.dtype} {plain.shape}".encode())
+                state.update(np.ascontiguousarray(plain).tobytes())
+    return state.hexdigest()[:24]
 
 
 def content(run: Run) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -12,6 +13,8 @@ from plants import BENCH, ENCODER_RAD, drive, pendulum, run_of, sweep, write
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from openant_tools.errors import BadInput
+from openant_tools.files import json_text
+from openant_tools.gap.cache import cache_folder, code
 from openant_tools.gap.diagnose import diagnose
 from openant_tools.gap.diagnosis import NONE, UNEXPLAINED, Diagnosis, Found, Span, read_diagnosis
 from openant_tools.gap.words import sentence, sizes, standing
@@ -52,7 +55,7 @@ def recorded(text: str, late_s: float = 0.0) -> list[Run]:
 @pytest.fixture(scope="module")
 def late(model: Path) -> Diagnosis:
     """The diagnosis of the robot whose commands come late."""
-    return diagnose(recorded(pendulum(), late_s=0.04), model)
+    return diagnose(recorded(pendulum(), late_s=0.04), model, recall=True)
 
 
 def test_a_robot_within_tolerance_is_healthy(model: Path) -> None:
@@ -80,6 +83,47 @@ def test_the_order_in_which_runs_are_named_does_not_matter(model: Path, late: Di
         assert same.effect == one.effect
         assert same.probability == pytest.approx(one.probability, abs=1e-6)
     assert other.gap["after"] == pytest.approx(first.gap["after"], rel=1e-3)
+
+
+def test_what_was_asked_before_is_answered_as_before(
+    model: Path, late: Diagnosis, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def work_it_out(*_: object) -> None:
+        raise InterruptedError
+
+    monkeypatch.setattr("openant_tools.gap.diagnose.hypotheses", work_it_out)
+    runs = recorded(pendulum(), late_s=0.04)
+    (place,) = cache_folder().glob("diagnosis-*.json")
+    kept = place.read_text()
+    assert json_text(diagnose(runs, model, recall=True).as_json()) == json_text(late.as_json())
+    assert kept == json_text(late.as_json())
+
+    def is_worked_out(runs: list[Run], **more: Any) -> None:
+        with pytest.raises(InterruptedError):
+            diagnose(runs, model, **{"recall": True, **more})
+
+    is_worked_out(runs, recall=False)
+    is_worked_out(runs, prior=["backlash"])
+    is_worked_out(runs[:2], hold_out=runs[2:])
+    changed = dict(runs[0].columns, **{"pos.joint": runs[0].columns["pos.joint"] + 1e-6})
+    is_worked_out([dataclasses.replace(runs[0], columns=changed), *runs[1:]])
+    for spoilt in ("", "{}", kept[:-100]):
+        place.write_text(spoilt)
+        is_worked_out(runs)
+    place.write_text(kept)
+    monkeypatch.setattr("openant_tools.gap.cache.COMPUTE", ("numpy",))
+    code.cache_clear()
+    is_worked_out(runs)
+    monkeypatch.undo()
+    code.cache_clear()
+    monkeypatch.setattr("openant_tools.gap.diagnose.hypotheses", work_it_out)
+    assert json_text(diagnose(runs, model, recall=True).as_json()) == json_text(late.as_json())
+    text = model.read_text()
+    try:
+        model.write_text(text.replace('frictionloss="0.03"', 'frictionloss="0.031"'))
+        is_worked_out(runs)
+    finally:
+        model.write_text(text)
 
 
 def test_sums_are_rounded_alike_on_any_number_of_cores(model: Path) -> None:
