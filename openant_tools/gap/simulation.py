@@ -106,7 +106,8 @@ def simulate(
             # A run of its own of random numbers to each portion, whatever the others are.
             rng = np.random.default_rng((seed, int(some[0])))
             mine = {name: np.full((len(some), *whole.shape[1:]), np.nan, np.float32) for name, whole in out.items()}
-            _Batch(stepped, [robots[k] for k in some], rng, warm_c, misread=misread).play(mine)
+            told = "torque" in names or "volt" in names
+            _Batch(stepped, [robots[k] for k in some], rng, warm_c, misread=misread, told=told).play(mine)
             for name, values in mine.items():
                 out[name][some] = values
     return Log(out)
@@ -146,9 +147,10 @@ class _Batch:
         rng: np.random.Generator,
         warm_c: Sequence[Array] | None,
         *,
-        misread: bool = False,
+        misread: bool,
+        told: bool,
     ) -> None:
-        self._rollouts, self._robots, self._rng = rollouts, robots, rng
+        self._rollouts, self._robots, self._rng, self._told = rollouts, robots, rng, told
         self._plant, self._segments = rollouts.plant, rollouts.segments
         self._n = len(robots)
         plant, copies = self._plant, len(self._segments)
@@ -252,7 +254,10 @@ class _Batch:
         for name, values in (("dof_armature", fields.armature), ("dof_damping", fields.damping)):
             self._batch.expand(name)[:, plant.dof] = values
         between = laws_of([robot.laws for robot in robots], len(plant.joints))
-        return [*([self._ask] if self._asked.any() else []), *first, *between, self._partly, self._note, *last]
+        before, note = ([self._ask] if self._asked.any() else []), [self._note]
+        if not self._told:  # of what motors give
+            before, note = [], []
+        return [*before, *first, *between, self._partly, *note, *last]
 
     def _begun(self, warm_c: Array) -> tuple[Array, Array]:
         """As each simulation begins: where setpoints of limited rate are (rad), and how warm its servos are (°C)."""
@@ -303,7 +308,7 @@ class _Batch:
         ctrl[:] = rest
         switches = self._switches()
         floor = "gyro" in out or "base" in out or plant.setup is Setup.FLOOR
-        states = _States(self._batch, plant, sims, longest, floor)
+        states = _States(self._batch, plant, sims, longest, base=floor, told=self._told)
         cable = self._cable()
         self._lead(control)
         before = self._servos.state
@@ -319,10 +324,10 @@ class _Batch:
                     self._share[some] = share
             ctrl[:, plant.ctrl] = control[:, self._led + step]
             self._servos.prepare(self._laws, time, before)
-            states.keep(step, before, self._given)
+            states.keep(step, before, self._given if self._told else None)
             if cable is not None:
                 cable()
-            self._batch.step(ids=np.arange(active, dtype=np.int32))
+            self._batch.step(ids=None if active == sims else np.arange(active, dtype=np.int32))
             time += plant.timestep
             before = self._servos.state
         states.keep(longest, before, None)
@@ -500,10 +505,10 @@ class _Batch:
 class _States:
     """All states of a batch, until they are sampled."""
 
-    def __init__(self, batch: Batch, plant: Plant, sims: int, steps: int, base: bool) -> None:
+    def __init__(self, batch: Batch, plant: Plant, sims: int, steps: int, *, base: bool, told: bool) -> None:
         n, self._h = len(plant.joints), plant.timestep
         self.pos, self.vel = np.empty((2, steps + 1, sims, n), np.float32)
-        self.torque, self.share = np.zeros((2, steps + 1, sims, n), np.float32)
+        self.torque, self.share = np.zeros((2, steps + 1 if told else 0, sims, n), np.float32)
         self._base = base and plant.free_joint is not None
         if self._base:
             joint = plant.free_joint
@@ -518,7 +523,7 @@ class _States:
         self.pos[step], self.vel[step] = state
         if given is not None:
             self.torque[step], self.share[step] = given
-        elif step:
+        elif len(self.torque):
             self.torque[step], self.share[step] = self.torque[step - 1], self.share[step - 1]
         if self._base:
             self.place[step], self.twist[step] = self._qpos, self._qvel
