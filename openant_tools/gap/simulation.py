@@ -147,8 +147,8 @@ class _Batch:
         rng: np.random.Generator,
         warm_c: Sequence[Array] | None,
         *,
-        misread: bool,
-        told: bool,
+        misread: bool = False,
+        told: bool = True,
     ) -> None:
         self._rollouts, self._robots, self._rng, self._told = rollouts, robots, rng, told
         self._plant, self._segments = rollouts.plant, rollouts.segments
