@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
@@ -46,7 +47,8 @@ def without_errors(run: Run, joints: Sequence[str]) -> tuple[Run, Telemetry]:
     """The run with positions that are none taken out (NaN): what was not read, and single-sample spikes.
 
     A joint cannot go far and be back within two samples. A spike lies beyond both neighbours, and without it they lie on a
-    smooth line; a true peak bends that line as well, a late sample lies between its neighbours.
+    smooth line; a true peak bends that line as well, a late sample lies between its neighbours. Where the command steps a joint may
+    turn back between two samples: what is no larger than that step is no spike there.
     """
     columns = dict(run.columns)
     glitches, missing = {}, {}
@@ -54,7 +56,7 @@ def without_errors(run: Run, joints: Sequence[str]) -> tuple[Run, Telemetry]:
         pos = run.column(f"pos.{joint}").copy()
         pos[run.column(f"ok.{joint}") == 0] = np.nan
         lost = int((~np.isfinite(pos)).sum())
-        spikes = _spikes(run.t, pos, resolution(run, "pos", joint))
+        spikes = _spikes(run.t, pos, run.column(f"cmd.{joint}"), resolution(run, "pos", joint))
         pos[spikes] = np.nan
         if lost or len(spikes):
             columns[f"pos.{joint}"] = pos
@@ -64,7 +66,7 @@ def without_errors(run: Run, joints: Sequence[str]) -> tuple[Run, Telemetry]:
     )
 
 
-def _spikes(t: Array, pos: Array, step: float) -> NDArray[np.int64]:
+def _spikes(t: Array, pos: Array, cmd: Array, step: float) -> NDArray[np.int64]:
     """Rows of samples that stand alone."""
     rows = np.flatnonzero(np.isfinite(pos))
     if len(rows) < 7:
@@ -84,7 +86,9 @@ def _spikes(t: Array, pos: Array, step: float) -> NDArray[np.int64]:
     beyond = np.maximum(x[inner] - high, low - x[inner])
     limit = max(GLITCH_QUANTA * step, GLITCH_TIMES * 1.4826 * float(np.median(np.abs(alone))))
     left = np.maximum(np.abs(off(inner - 1, 1, 2)), np.abs(off(inner + 1, 2, 1)))
-    spike = (beyond > limit) & (left < GLITCH_ALONE * beyond + step)
+    near = sliding_window_view(cmd[rows], 4)[: len(inner)]  # from two rows before a sample to one after it
+    stepped = np.nan_to_num(np.fmax.reduce(near, axis=1) - np.fmin.reduce(near, axis=1))
+    spike = (beyond > np.maximum(limit, stepped)) & (left < GLITCH_ALONE * beyond + step)
     found: NDArray[np.int64] = rows[inner[spike]]
     return found
 
