@@ -87,7 +87,9 @@ def diagnose(
     if recall:
         place = cache_folder() / f"diagnosis-{_asked(experiment, model, runs, hold_out, prior)}.json"
         with contextlib.suppress(BadInput):  # not there, cut or another's: it is made anew
-            return read_diagnosis(place)
+            found = read_diagnosis(place)
+            place.touch()  # used now
+            return found
     trials, rows = hypotheses(experiment, prior, lambda share, words: tell(0.02 + 0.73 * share, words))
     decision = decide(rows, trials.assessment.evidence.anomaly)
     # Others are looked for also beside a cause than which something unknown is likelier so far, or another cause as likely.
@@ -116,8 +118,9 @@ def diagnose(
     given = Given(model, tuple(runs), tuple(hold_out), tuple(prior))
     found = finding(trials, given, Tried(rows, declined, there), decision, chosen)
     if recall:
-        write_text(place, json_text(found.as_json()))
-        keep_small(place)
+        with contextlib.suppress(OSError):  # a full disk takes nobody's answer away
+            write_text(place, json_text(found.as_json()))
+            keep_small(place)
     return found
 
 

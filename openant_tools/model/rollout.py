@@ -120,9 +120,9 @@ class RunStretch:
 
 
 def allowed_threads() -> int:
-    """How many threads a process may have by OMP_NUM_THREADS, which joblib sets where it runs processes side by side: threads of all would wait for each other.
+    """How many threads a process may have by OMP_NUM_THREADS; 0 where it says nothing.
 
-    0 where it says nothing.
+    Joblib sets it where it runs processes side by side: threads of all would wait for each other.
     """
     allowed = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     return int(allowed) if allowed.isdecimal() else 0

@@ -389,9 +389,8 @@ def test_a_full_disk_ends_walking_until_the_builder_says_otherwise(
     walker: Walker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     env = walker.env
-    monkeypatch.setattr(
-        env, "_tag_patience_s", 20.0
-    )  # in these small pictures a bit of the tag is misread for seconds at times
+    # In these small pictures a bit of the tag is misread for seconds at times.
+    monkeypatch.setattr(env, "_tag_patience_s", 20.0)
     limits = resource.prlimit(env.link._engine.pid, resource.RLIMIT_FSIZE)
     resource.prlimit(env.link._engine.pid, resource.RLIMIT_FSIZE, (1, limits[1]))
     info = walker.until_it_ends(200)
