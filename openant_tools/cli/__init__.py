@@ -10,6 +10,7 @@ import logging
 import os
 import sys
 from collections.abc import Sequence
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
 import click
@@ -199,6 +200,14 @@ def main(argv: Sequence[str] | None = None) -> None:
         remedy = REMEDIES.get(error.errno or 0)
         click.echo(f"openant: {where}{error.strerror or error}" + (f" → {remedy}" if remedy else ""), err=True)
         sys.exit(2)
+    except BrokenExecutor:
+        click.echo(
+            "openant: a process that did a part of this was killed; memory may be short → close other programs, and "
+            "run the command again",
+            err=True,
+        )
+        _log.info("a process was killed", exc_info=True)
+        sys.exit(1)
     except (KeyboardInterrupt, click.Abort):
         with contextlib.suppress(OSError):  # the terminal may be what has gone
             click.echo("openant: interrupted", err=True)

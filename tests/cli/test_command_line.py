@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import click
@@ -430,3 +431,17 @@ def test_what_is_no_number_is_refused_by_name_on_every_command(
         assert option in line or "No such option" in line, line
         assert "→" in line
         assert said.out == ""
+
+
+def test_a_process_that_was_killed_is_said_in_a_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def killed(**_: object) -> None:
+        raise BrokenProcessPool("exit codes of the workers are {SIGKILL(-9)}")
+
+    monkeypatch.setattr("openant_tools.cli.openant.main", killed)
+    with pytest.raises(SystemExit) as ended:
+        main(["gap"])
+    assert ended.value.code == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("openant: a process that did a part of this was killed; memory may be short → ")
