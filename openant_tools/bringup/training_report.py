@@ -428,22 +428,22 @@ def training_report(record: TrainingRecord) -> Report:
         else f"{percent(late, decimals=1)} of steps late"
     )
     reached = f"{speed} at the end of {hours}" if measured else "Ended before its speed was noted"
-    verdict = f"{reached}, {rhythm}; {helped}, {record.words_given} by somebody's word."
+    verdict = f"{reached}, {rhythm}; {helped}, {record.words_given} confirmed by a person."
     busy = late > LATE_STEPS
     agent, seed = record.facts.get("agent", "agent"), record.facts.get("seed", "unknown")
     answer = ReportSummary(
         verdict,
         Figure(_speed_figure(record), "Average reward over 120 s against robot time; each intervention with its number."),
-        "Late steps are longer than the agent was promised, and what it sees then is another robot's answer."
+        "Late steps teach the agent delays that it will not meet elsewhere."
         if busy
         else "What was learned was learned at the robot's own pace." if not math.isnan(late)
         else "What was learned was learned without a deadline: a robot in real time has one.",
-        "Find out below who held it up, and close that." if busy else f"`openant eval {record.run} --env hardware`",
+        "The table below names the programs that held it up: close them." if busy else f"`openant eval {record.run} --env hardware`",
         "" if math.isnan(late) else "warn" if busy else "good",
         figures=[
             KeyFigure("speed", speed, f"last {number(min(LAST_S, record.robot_s) / 60, 'min')}" if measured else "never noted"),
             KeyFigure("steps late", percent(late, decimals=1) if not math.isnan(late) else "–", "" if not math.isnan(late) else "stepped time"),
-            KeyFigure("went on by itself", f"{record.alone}×", f"{record.words_given}× by somebody's word"),
+            KeyFigure("went on by itself", f"{record.alone}×", f"{record.words_given}× confirmed by a person"),
             KeyFigure("answers lost", percent(lost, decimals=2)),
         ],
     )  # fmt: skip

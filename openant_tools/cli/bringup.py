@@ -101,7 +101,7 @@ def bringup(
     if json_file is not None:
         write_text(json_file, json_text(result))
     if red:
-        click.echo(f"not green: {', '.join(WALK[name].title for name in red)}; the findings are in {folder.findings}")
+        click.echo(f"not passed: {', '.join(WALK[name].title for name in red)}; the findings are in {folder.findings}")
         return 1
     click.echo(f"{folder.passport}: every step says yes ({number(time.monotonic() - began, 's', decimals=0)})")
     return 0

@@ -72,7 +72,7 @@ def _print(whole: Any, figures: dict[str, Any]) -> None:
     before, after, floor = (gap_words(figures[name]) for name in ("gap_before_rad", "gap_after_rad", "floor_rad"))
     click.echo(
         f"\nheld-out error {before} → {after} (floor {floor}); {figures['settings_within_interval']} of "
-        f"{figures['settings_determined']} settings recovered within their intervals"
+        f"{figures['settings_determined']} settings within the intervals that were found"
     )
     if figures["walking"] is not None:
         found = figures["walking"]

@@ -146,7 +146,9 @@ class CommandFace:
             )
         while True:
             given = FloatPrompt.ask(
-                f"{question} [{ask.unit}]" if ask.unit else question, console=self.console, default=ask.default
+                f"{question} {escape(f'[{ask.unit}]')}" if ask.unit else question,
+                console=self.console,
+                default=ask.default,
             )
             if (
                 isinstance(given, int | float)

@@ -32,7 +32,7 @@ def train() -> None:
 
 
 @train.command(cls=Moving)
-@training_options(30_000, 0.12, "checkpoints, transitions, learning curve")
+@training_options("sac", "checkpoints, transitions, learning curve")
 @click.option(
     "--dt", type=Number(0.0, 10.0, min_open=True), metavar="S", help="Length of a step. Default: the robot's, 0.12 s."
 )

@@ -23,7 +23,7 @@ __all__ = ["sarsa"]
 
 
 @click.command(cls=Moving)
-@training_options(72_000, 0.05, "the log of decisions, learning curve")
+@training_options("sarsa", "the log of decisions, learning curve")
 @click.option(
     "--dt",
     type=Number(0.0, 10.0, min_open=True),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from openant_tools.bringup.gait import STEP_S, steps_of
 from openant_tools.cli.learning import LearningBar, kit_option, need_agents, robot_argument
 from openant_tools.cli.log import mention
 from openant_tools.cli.options import robot_option
@@ -58,13 +59,13 @@ class TrainingPlace:
         return self.name == HARDWARE_ID
 
 
-def training_options(hour: int, step_s: float, leaves: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def training_options(agent: str, leaves: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """The robot and where it trains, as `place`; `--steps`, `--seed`, `--out`, `--task`.
 
     Args:
-        hour: so many steps are an hour of robot time. step_s: s, of each.
-        leaves: what is in a run's folder, in words.
+        agent: of which an hour of robot time is the default. leaves: what is in a run's folder, in words.
     """
+    hour = steps_of(agent, 60)
     options = (
         robot_option,
         kit_option,
@@ -80,7 +81,7 @@ def training_options(hour: int, step_s: float, leaves: str) -> Callable[[Callabl
         ),
         click.option(
             "--steps", type=click.IntRange(min=1), default=hour, show_default=True,
-            help=f"Train until the run is this long; {hour:,} steps of {exact(step_s, 's')} are an hour.",
+            help=f"Train until the run is this long; {hour} steps of {exact(STEP_S[agent], 's')} are an hour.",
         ),
         click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True),
         click.option(

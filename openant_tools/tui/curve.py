@@ -10,7 +10,7 @@ from openant_tools.numbers import number
 from openant_tools.tui.braille import trace
 from openant_tools.tui.marks import BLUE, ORANGE, plain, spelled
 
-__all__ = ["PAPER_CM_S", "curve_lines"]
+__all__ = ["PAPER_CM_S", "curve_lines", "within_reach"]
 
 Array = NDArray[np.float64]
 
@@ -21,6 +21,17 @@ PAPER_CM_S = {
 }
 #: columns of the scale on the left
 SCALE = 8
+#: times the best that a level may be, to be drawn: beyond, the curve would be too flat to read
+REACH = 3
+
+
+def within_reach(reward: Array, level: float | None) -> bool:
+    """Whether a level is drawn beside a curve in cm/s."""
+    return level is not None and level <= REACH * _top(reward)
+
+
+def _top(reward: Array) -> float:
+    return max(1.0, 1.05 * float(reward.max()))
 
 
 def curve_lines(step: Array, reward: Array, stop: float, level: float | None, width: int, height: int) -> list[Text]:
@@ -29,8 +40,9 @@ def curve_lines(step: Array, reward: Array, stop: float, level: float | None, wi
     Args:
         step, reward: (n,) and cm/s. stop: where the axis ends. level: a dotted line, where the scale reaches it.
     """
-    low, high = min(0.0, float(reward.min())), max(1.0, 1.05 * float(reward.max()))
-    if level is not None and level <= 3 * high:
+    low, high = min(0.0, float(reward.min())), _top(reward)
+    level = level if within_reach(reward, level) else None
+    if level is not None:
         high = max(high, 1.1 * level)
     ascii_only = plain()
     wall, corner, floor, dots = ("|", "+", "-", ".") if ascii_only else ("│", "└", "─", "┄")
@@ -44,7 +56,7 @@ def curve_lines(step: Array, reward: Array, stop: float, level: float | None, wi
     lines = []
     for k, line in enumerate(drawn):
         text = Text(f"{names.get(k, ''):>{SCALE}}{wall}")
-        at_level = level is not None and level <= high and k == row(level)
+        at_level = level is not None and k == row(level)
         for character in line:
             if character == " " and at_level:
                 text.append(dots, ORANGE)

@@ -44,7 +44,7 @@ def _condition(history: History, joint: str) -> Condition:
     code = history.newest(f"err.{joint}")
     word = ERR_CODES[int(code)] if np.isfinite(code) and 0 <= code < len(ERR_CODES) else ""
     if word == "alert":
-        return Condition("fail", "alert", "raises its alert bit: read its hardware error status")
+        return Condition("fail", "alert", "reports a hardware error: `openant comms reboot` says which")
     if not answered[-1]:
         last = history.t[answered][-1] if answered.any() else history.t[0]
         silent = float(history.t[-1] - last)

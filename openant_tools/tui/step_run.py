@@ -113,7 +113,7 @@ class StepRun:
             # Of what was ended from here that is the reason, whatever broke off by it.
             self._done(None, str(self._ended or error))
         except ModuleNotFoundError as error:
-            self._done(None, f"this step is not part of this version ({error.name} is missing)")
+            self._done(None, f"this step needs the package {error.name}, which is not installed")
         except Exception as error:  # a fault of the program: the builder sees it, torque is off, the file has the rest
             log = self._bench.folder.path / ERRORS
             with log.open("a", encoding="utf-8") as file:

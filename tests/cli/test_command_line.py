@@ -24,6 +24,8 @@ from plants import drive, pendulum, run_of, sweep
 
 from openant_tools.cli import main
 from openant_tools.cli import openant as manual
+from openant_tools.cli.face import CommandFace
+from openant_tools.procedure.step import Ask
 from openant_tools.recording.tables import write_table
 
 OPENANT = (sys.executable, "-m", "openant_tools.cli")
@@ -445,3 +447,17 @@ def test_a_process_that_was_killed_is_said_in_a_line(
     assert ended.value.code == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("openant: a process that did a part of this was killed; memory may be short → ")
+
+
+def test_a_question_for_a_number_says_its_unit(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In brackets, which are no markup of the terminal's colours."""
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
+    given = iter(["700", "3"])
+    monkeypatch.setattr("builtins.input", lambda: next(given))
+    asked = Ask("Soak for how long?", unit="min", default=10.0, low=0, high=600)
+    assert CommandFace(yes=False).answer(asked) == 3.0
+    said = capsys.readouterr()
+    assert "Soak for how long? [min] (10.0): " in said.out + said.err
+    assert "from 0 to 600 min" in said.out + said.err

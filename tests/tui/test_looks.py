@@ -30,6 +30,7 @@ from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui import leg_map
 from openant_tools.tui.app import SCREENS, OpenAnt
+from openant_tools.tui.dialogs import Question
 from openant_tools.tui.feeds import History
 from openant_tools.tui.found import numbers_lines
 from openant_tools.tui.marks import plain
@@ -110,6 +111,20 @@ class TextFile(SingleFileSnapshotExtension):
     _write_mode = WriteMode.TEXT
 
 
+#: exit codes of a command that was started on a screen
+ENDED: Mapping[str, int] = {"done": 0, "stopped": 130, "failed": 1}
+
+
+class Ended:
+    """A process that is over."""
+
+    def __init__(self, code: int) -> None:
+        self._code = code
+
+    def poll(self) -> int:
+        return self._code
+
+
 class Quiet:
     """A run of a step that does nothing."""
 
@@ -184,6 +199,14 @@ async def look_at(name: str, app: OpenAnt, pilot: Pilot[int], run: Run, look: Lo
         getattr(app.screen, draw, lambda: None)()
     await settle(app, pilot)
     look("running")
+    if name in ("learn", "gap"):
+        for state, code in ENDED.items():
+            for process in (app.session.training, app.session.diagnosing):
+                process._process = Ended(code)  # type: ignore[assignment]
+            for draw in ("draw_progress", "draw_process"):
+                getattr(app.screen, draw, lambda: None)()
+            await settle(app, pilot)
+            look(state)
     app.session.faults.note("knee_fl", "does not answer")
     app.session.faults.note("bus", "8 of 8 servos do not answer: power, first cable, or a busy computer")
     await settle(app, pilot)
@@ -233,7 +256,8 @@ def walk_through(
 def worked(robot: RobotFolder, monkeypatch: pytest.MonkeyPatch) -> Run:  # noqa: F811
     run = a_worked_folder(robot, monkeypatch)
     monkeypatch.setattr(leg_map, "REST_S", BRIEF_S)
-    monkeypatch.setattr(Process, "running", property(lambda self: True))
+    monkeypatch.setattr(Process, "running", property(lambda self: self._process is None))
+    monkeypatch.setattr(Process, "last_words", "the bus: nothing answered at 1000000 baud → is 12 V on?")
     monkeypatch.setattr(Process, "stop", lambda self: None)
     return run
 
@@ -319,6 +343,29 @@ def scrolled(one: Widget) -> bool:
 
 def within(a: Widget, b: Widget) -> bool:
     return a in b.ancestors or b in a.ancestors
+
+
+@pytest.mark.parametrize("ascii_only", [False, True], ids=["colour", "ASCII"])
+def test_dialogs_read_as_they_did(ascii_only: bool, worked: Run, snapshot: SnapshotAssertion) -> None:
+    plain(ascii_only)
+    shown = list[str]()
+
+    async def look() -> None:
+        app = OpenAnt(Path("my-ant"), ticking=False)
+        async with app.run_test(size=SIZES[0]) as pilot:
+            for key in ("f1", "ctrl+o"):
+                await pilot.press(key)
+                await settle(app, pilot)
+                shown.append(f"==== {key}\n{seen(app)}")
+                assert not faults_of(app, SIZES[0])
+                await pilot.press("escape")
+                await settle(app, pilot)
+            app.push_screen(Question("Is it on the floor, its cables untangled?", "Yes, train", "No"))
+            await settle(app, pilot)
+            shown.append(f"==== a question\n{seen(app)}")
+
+    asyncio.run(look())
+    assert "\n".join(shown) + "\n" == snapshot(extension_class=TextFile)
 
 
 @pytest.mark.parametrize("ascii_only", [False, True])

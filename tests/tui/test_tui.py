@@ -27,6 +27,7 @@ from textual.widgets import Input
 from openant_tools.bringup.gait import first_look
 from openant_tools.bringup.walk import WALK
 from openant_tools.calib.wires import engine_config
+from openant_tools.cli import main
 from openant_tools.comms import messages
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.engine_process import EngineProcess
@@ -980,20 +981,62 @@ def test_what_was_learned_is_evaluated_played_compared_and_diagnosed_from_its_sc
     assert told[2].startswith(f"openant gap diagnose {run / 'recordings' / 'b.mcap'} {there} --json ")
 
 
-def test_steps_that_are_no_number_are_said_and_stay_said(robot: RobotFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_minutes_that_are_no_number_are_said_and_stay_said(robot: RobotFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Process, "start", lambda self: pytest.fail("it started"))
 
     async def look() -> None:
         app = OpenAnt(robot.path, ticking=False)
         async with app.run_test(size=(80, 24), notifications=True) as pilot:
             await _go(pilot, "learn")
-            app.screen.query_one("#steps", Input).value = ""
+            app.screen.query_one("#minutes", Input).value = ""
             app.screen.query_one("#choices", Choices).focus()
             await pilot.press("enter")
             await pilot.pause(0.2)
-            assert "steps and seed are whole numbers" in screen_text(app)
+            assert "minutes and seed are whole numbers" in screen_text(app)
 
     asyncio.run(look())
+
+
+@pytest.mark.parametrize(("agent", "steps"), [("sac", 30_000), ("sarsa", 72_000)])
+def test_an_hour_is_as_many_steps_as_the_command_says(
+    agent: str, steps: int, robot: RobotFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(Process, "start", lambda self: None)
+
+    async def commanded() -> str:
+        app = OpenAnt(robot.path, ticking=False)
+        async with app.run_test(size=(80, 24)) as pilot:
+            await _go(pilot, "learn")
+            cast(LearnScreen, app.screen).start(agent)
+            assert app.session.training is not None
+            return app.session.training.command
+
+    assert f" --steps {steps} " in asyncio.run(commanded())
+    with pytest.raises(SystemExit):
+        main(["train", agent, "--help"])
+    told = " ".join(capsys.readouterr().out.split())
+    assert f"{steps} steps of" in told, "as the command itself has it"
+    assert f"[default: {steps};" in told
+
+
+@pytest.mark.parametrize(("cm_s", "drawn"), [(1.0, False), (4.0, False), (5.0, True), (20.0, True)])
+def test_the_paper_is_said_to_be_dotted_where_it_is_drawn(
+    cm_s: float, drawn: bool, robot: RobotFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = robot.runs / "sac-0"
+    run.mkdir(parents=True)
+    curve = "".join(f"{n},{n},{cm_s / 100 * n / 9}\n" for n in range(10))
+    (run / "learning_curve.csv").write_text(f"step,seconds,average_reward_m_s\n{curve}")
+
+    async def look() -> str:
+        app = OpenAnt(robot.path, ticking=False)
+        async with app.run_test(size=(80, 24)) as pilot:
+            await _go(pilot, "learn")
+            return screen_text(app)
+
+    text = asyncio.run(look())
+    assert "13 to 23 cm/s" in text
+    assert ("dotted, the paper" in text) == ("┄" in text) == drawn
 
 
 def test_training_is_the_command_that_one_would_type(robot: RobotFolder) -> None:

@@ -15,10 +15,10 @@ from textual.widget import Widget
 from textual.widgets import Input, Label, OptionList
 from textual.widgets.option_list import Option
 
-from openant_tools.bringup.gait import FIRST_STEPS, first_look, walks_at
+from openant_tools.bringup.gait import FIRST_STEPS, first_look, steps_of, walks_at
 from openant_tools.numbers import number, percent
 from openant_tools.tui.choices import Choices
-from openant_tools.tui.curve import PAPER_CM_S, curve_lines
+from openant_tools.tui.curve import PAPER_CM_S, curve_lines, within_reach
 from openant_tools.tui.dialogs import Question
 from openant_tools.tui.marks import marked, plain, spelled
 from openant_tools.tui.page import Page
@@ -37,7 +37,10 @@ BEFORE = (
     "The robot moves, for as long as it trains. Is it on the floor, inside the circle, facing its reward, its cables outside "
     "the circle and untangled?"
 )
-_WORDS = {"sac": "soft actor-critic, as in the paper", "sarsa": "SARSA(lambda) with tile coding, as in the paper"}
+_WORDS = {
+    "sac": "soft actor-critic, small neural networks",
+    "sarsa": "SARSA(lambda), a table over what it sees",
+}
 
 
 class HowItGoes(Widget):
@@ -60,11 +63,11 @@ stands on the screen. *A first look* trains for a quarter of an hour of robot ti
 demo does; the others have the paper's. You may leave this screen meanwhile. Stopping saves; the same choice goes on from there. `Space` stops
 training on the robot, too, with torque off.
 
-*sac*, soft actor-critic, learns small neural networks; *sarsa* a table of what each move was worth, over tiles of what the
-robot sees. A step is 0.12 s. The seed is what chance begins with; each number has a run of its own.
+*sac*, soft actor-critic, learns small neural networks, in steps of 0.12 s; *sarsa* a table of what each move was worth, over
+tiles of what the robot sees, in steps of 0.05 s. The seed starts the random numbers: another seed makes another run.
 
-The curve is the average reward over the last 120 s of robot time, in cm/s: how fast it walks where it should. The dotted line
-is what the paper's agents reached.
+The curve is the average reward over the last 120 s of robot time, in cm/s: how fast it walks where it should. A dotted line
+is what the paper's agents reached, once the curve comes near it.
 
 With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is recorded), *compare* it with the other runs, or
 `d`: have its last recording on the robot *diagnosed*, which says what the simulation lacks.
@@ -74,11 +77,11 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
     def body(self) -> ComposeResult:
         with Vertical(id="form"):
             with Horizontal(classes="line"):
-                yield Label("steps")
-                yield Input("30000", type="integer", id="steps")
+                yield Label("minutes")
+                yield Input("60", type="integer", id="minutes")
                 yield Label("seed")
                 yield Input("0", type="integer", id="seed")
-                yield Label("30000 steps are an hour of robot time", classes="after")
+                yield Label("minutes are robot time", classes="after")
             yield Choices(id="choices")
         yield HowItGoes(id="progress")
 
@@ -87,7 +90,7 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         if self.session.learning:
             return [Option("Stop and save", id="stop")]
         return [
-            Option(f"A first look, in simulation: {FIRST_STEPS} steps with settings that walk sooner", id=FIRST),
+            Option("A first look, in simulation: 15 minutes, settings that walk sooner", id=FIRST),
             *(Option(f"Train {name} in simulation: {_WORDS[name]}", id=name) for name in AGENTS),
             *(Option(f"Train {name} on the robot: it moves", id=f"{name}{ON_ROBOT}") for name in AGENTS),
             *self._after(),
@@ -115,7 +118,7 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         super().on_mount()
         self.set_interval(REFRESH_S, self.draw_progress)
         self._offer()
-        self.query_one("#steps", Input).focus()
+        self.query_one("#minutes", Input).focus()
 
     def _offer(self) -> None:
         chooser = self.query_one("#choices", Choices)
@@ -157,7 +160,7 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
 
     def _play(self, folder: Path, *arguments: str, where: Place = "sim") -> None:
         if self.session.learning:
-            self.notify("one at a time: stop what runs first", severity="warning")
+            self.notify("a run is in progress: stop it first", severity="warning")
             return
         self.session.training = PlayProcess(arguments, folder, where)
         self.session.training.start()
@@ -215,14 +218,14 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
             self.notify("there is no robot's folder: make one in Settings (s on the first screen)", severity="error")
             return
         if self.session.learning:
-            self.notify("one run is enough at a time: stop it first", severity="warning")
+            self.notify("a run is in progress: stop it first", severity="warning")
             return
-        steps, seed = (self.query_one(f"#{name}", Input).value for name in ("steps", "seed"))
-        if not steps.isdigit() or int(steps) < 1 or not seed.isdigit():
-            self.notify("steps and seed are whole numbers", severity="error")
+        minutes, seed = (self.query_one(f"#{name}", Input).value for name in ("minutes", "seed"))
+        if not minutes.isdigit() or int(minutes) < 1 or not seed.isdigit():
+            self.notify("minutes and seed are whole numbers", severity="error")
             return
         name = agent if where == "sim" else f"{agent}-{where}"
-        length = int(steps)
+        length = steps_of(agent, int(minutes))
         options: tuple[str, ...] = ()
         if first:
             name, length, options = f"{name}-first", FIRST_STEPS, first_look()
@@ -278,12 +281,13 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         level, words = PAPER_CM_S.get(run.name.partition("-")[0], (None, ""))
         text.append(spelled(walks_at(float(reward[-1]))), "bold")
         text.append(f"; step {number(step[-1])}{share}, {minutes} min of robot time\n")
+        dotted = "dotted, " if within_reach(100 * reward, level) else ""
         stop = max(float(step[-1]), float(steps or 0.0))
         # Its axis takes two lines, what it is the last, and the command of what is under way a second one.
         rows = min(max(room - text.plain.count("\n") - (3 if steps is None else 4), 3), MOST_ROWS)
         for line in curve_lines(step, 100 * reward, stop, level, self.size.width - 4, rows):
             text.append_text(line).append("\n")
         text.append(
-            f"mean of 120 s{f'; dotted: the paper, {words}' if words else ''}\n",
+            f"mean of 120 s{f'; {dotted}the paper: {words}' if words else ''}\n",
             "dim" if not plain() else "",
         )

@@ -274,7 +274,7 @@ where the number lies. `l` shows the log of what was said and done instead.
         self.say(
             marked(
                 "warn",
-                f"it was left at {left.words}: {left.done_words} {'is' if len(left.done) == 1 else 'are'} done",
+                f"stopped after {left.words}; done: {left.done_words}",
             )
         )
         onwards = StepChoice(f"Go on at {len(left.done) + 1} of {len(left.of)}: {left.next}", self.begin)
@@ -359,9 +359,7 @@ where the number lies. `l` shows the log of what was said and done instead.
         if self._fits(whole):
             return whole
         first = whole.split("\n")[0]
-        return first.append(
-            f"\n  {mark('warn')} {len(self._found.lines)} to be seen to, listed below", MARKS["warn"].colour
-        )
+        return first.append(f"\n  {mark('warn')} {len(self._found.lines)} problems, listed below", MARKS["warn"].colour)
 
     def _fits(self, whole: Text) -> bool:
         return sum(self._rows(line) for line in whole.plain.split("\n")) <= FOUND_LINES
@@ -494,7 +492,7 @@ where the number lies. `l` shows the log of what was said and done instead.
             self.say(marked("warn", f"{words!r} is no number"))
             return
         if not (event.low is None or value >= event.low) or not (event.high is None or value <= event.high):
-            self.say(marked("warn", f"{number(value)} is outside {span(event.low, event.high)}"))
+            self.say(marked("warn", f"{number(value, event.unit)}: enter {span(event.low, event.high, event.unit)}"))
             return
         self.reply(value, exact(value, event.unit))
 
