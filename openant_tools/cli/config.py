@@ -185,7 +185,7 @@ def _source(entry: Provenance | None) -> str:
     if entry.date:
         parts.append(f"on {entry.date:%Y-%m-%d}")
     if entry.low is not None and entry.high is not None:
-        parts.append(f"({span(entry.low, entry.high)})")
+        parts.append(f"({span(entry.low, entry.high, 'rad')})")
     return " ".join(parts)
 
 

@@ -80,7 +80,7 @@ def training_options(hour: int, step_s: float, leaves: str) -> Callable[[Callabl
         ),
         click.option(
             "--steps", type=click.IntRange(min=1), default=hour, show_default=True,
-            help=f"Train until the run is this long; {hour:,} steps of {exact(step_s, 's')} are an hour.",
+            help=f"Train until the run is this long; {hour} steps of {exact(step_s, 's')} are an hour.",
         ),
         click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True),
         click.option(
