@@ -150,8 +150,8 @@ def check(bench: Bench) -> Procedure:
         for name, share in outside.items():
             signal, _, joint = name.partition(".")
             words, unit = OBSERVED[signal]
-            bounds = span(*config.observation[name], unit)
-            yield Say(f"{words} {joint} left {bounds} for {percent(share)} of the twitch", "warn")
+            within = span(*config.observation[name], unit)
+            yield Say(f"{words} {joint} left {within} for {percent(share)} of the twitch", "warn")
     for line in BEFORE_A_SESSION:
         yield Say(line)
     return _finding(

@@ -313,7 +313,7 @@ def _view(bench: Bench, config: RobotConfig, where: str | int, parts: Parts) -> 
     origin_id, body_id = config.camera.origin_tag_id, config.camera.body_tag_id
     if origin_id not in seen:
         raise HardwareFault(
-            f"the origin's tag {origin_id} ({config.camera.tag_family}) is not in the picture (seen: {sorted(seen) or 'none'})",
+            f"the origin's tag {origin_id} ({config.camera.tag_family}) is not in the picture (seen: {', '.join(map(str, sorted(seen))) or 'none'})",
             where=str(where), remedy="lay it flat into view; is the family right, the light even, the picture sharp?",
         )  # fmt: skip
     others = sorted(id for id in seen if id != origin_id)

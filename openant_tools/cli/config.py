@@ -219,7 +219,7 @@ def _print(folder: RobotFolder, configuration: RobotConfig) -> None:
             motor.joint,
             str(motor.id),
             motor.model,
-            f"{motor.direction:+d}",
+            number(motor.direction, sign=True),
             _degrees(motor.zero_offset_rad),
             f"{_degrees(motor.min_rad)} … {_degrees(motor.max_rad)}",
             _source(configuration.provenance_of(f"motors.{motor.joint}.zero_offset_rad")),
