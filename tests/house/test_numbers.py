@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from places import ROOT
+from places import ROOT, TESTS
+from readable import unreadable
 
 from openant_tools.comms.hardware import changes
 from openant_tools.numbers import chosen, column, exact, number, percent, span, typed
@@ -169,6 +170,18 @@ def test_no_module_formats_a_number_that_people_read():
                 if spoken or not any(MARK in line for line in lines[node.lineno - 1 : node.end_lineno])
             ]
     assert not found, f"print with openant_tools.numbers: {found}"
+
+
+def test_what_people_read_has_units_of_people_and_no_more_digits_than_a_measurement():
+    """As it came out: `tests/builder.py` asks this of every finding that a step makes of a virtual robot, too."""
+    assert unreadable("slow sweep; then 0.0412387612 N·m") == ["0.0412387612"]
+    assert unreadable("up to 0.25 rad, 3.1 rad/s") == ["5 rad", "1 rad"]
+    assert unreadable("reads {'id': 10}, seen: [1, 2], was None") == ["{'id':", "[1,", "None"]
+    assert not unreadable("12.0° (11.5 to 12.6), 4.72 N·m/rad, firmware 4.5.100, 192.168.100.100, run 20260101.mcap")
+    screens = sorted((TESTS / "tui" / "__snapshots__" / "test_looks").glob("*.txt"))
+    assert screens
+    found = {path.name: odd for path in screens if (odd := unreadable(path.read_text(encoding="utf-8")))}
+    assert not found
 
 
 def test_what_eight_servos_are_told_alike_is_one_line():

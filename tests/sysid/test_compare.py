@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from readable import unreadable
 
 from openant_tools.cli import main
 from openant_tools.robot.config import Provenance
@@ -53,6 +54,7 @@ def test_a_joint_that_aged_is_named_and_the_report_shows_it(tmp_path: Path, caps
     )
     out = capsys.readouterr().out
     assert "Changed beyond chance at knee_fl: dry friction of knee_fl (+50 %); 24 parameters were compared." in out
+    assert not unreadable(out)
     content = json.loads((tmp_path / "c.json").read_text())
     assert content["joints_changed"] == ["knee_fl"]
     friction = content["parameters"]["coulomb_friction.knee_fl"]
