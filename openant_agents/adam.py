@@ -67,5 +67,5 @@ class Adam:
             for name, tensor in (("step", self._counts[k]), ("exp_avg", mean), ("exp_avg_sq", self._squares[k])):
                 new = kept[k][name] if kept else torch.zeros_like(tensor)
                 if new.shape != tensor.shape:
-                    raise ValueError(f"{name} has shape {tuple(new.shape)}, not {tuple(tensor.shape)}")
+                    raise ValueError(f"{name} has another shape than the parameter that it belongs to")
                 tensor.copy_(new)

@@ -16,6 +16,7 @@ from openant_env.observations import ORDERS, layout
 from openant_env.robots import SimulatedRobot
 from openant_env.tasks import BackAndForth, make_task
 from openant_tools.errors import BadInput
+from openant_tools.numbers import exact
 
 __all__ = ["AntBase", "Observation", "OnFall", "unit"]
 
@@ -55,7 +56,9 @@ class AntBase(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
                 f"no such order of observations: {observation_order!r}", remedy=f"choose one of {', '.join(ORDERS)}"
             )
         if time_limit_s is not None and not time_limit_s > 0.0:
-            raise BadInput(f"the time limit is {time_limit_s} s", remedy="give a time above 0, or None for no limit")
+            raise BadInput(
+                f"the time limit is {exact(time_limit_s, 's')}", remedy="give a time above 0, or None for no limit"
+            )
         self.robot = robot
         self.dt = robot.dt_s if dt is None else float(dt)
         self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / self.dt)) if self.dt > 0.0 else 1}

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from openant_tools.errors import BadInput
+from openant_tools.numbers import exact
 
 __all__ = ["TASKS", "BackAndForth", "Forward", "Task", "make_task"]
 
@@ -80,7 +81,7 @@ class BackAndForth(Task):
         if scored not in ("paper", "platform"):
             raise BadInput(f"no such way of scoring: {scored!r}", remedy="use 'paper' or 'platform'")
         if not radius_m > 0.0:
-            raise BadInput(f"the circle's radius is {radius_m} m", remedy="give a radius above 0")
+            raise BadInput(f"the circle's radius is {exact(radius_m, 'm')}", remedy="give a radius above 0")
         self.radius_m = float(radius_m)
         self.ox, self.oy = (float(value) for value in origin)
         self.scored = scored

@@ -36,7 +36,7 @@ SMALL = {"s": (1e3, "ms"), "A": (1e3, "mA"), "m": (1e3, "mm")}
 #: below how much of the unit the smaller one is read
 SMALL_BELOW = {"s": 0.1, "A": 0.1, "m": 0.1}
 #: words of an error of position in the name of a quantity
-_ERROR = re.compile(r"\b(gap|floor|residual|error|disagree)", re.IGNORECASE)
+_ERROR = re.compile(r"\b(gap|floor|residual|error)", re.IGNORECASE)
 
 
 def is_error(name: str) -> bool:

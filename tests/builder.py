@@ -8,6 +8,8 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+from readable import unreadable
+
 from openant_tools.bringup.simulated_builder import SimulatedBuilder
 from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.step import (
@@ -121,6 +123,9 @@ class Robot:
             found = drive(procedure, builder)
             shares = [e.share for e in builder.events[before:] if isinstance(e, Progress) and e.share is not None]
             assert shares == sorted(shares), f"what is done does not become undone: {shares}"
+            told = (getattr(e, "words", getattr(e, "question", "")) for e in builder.events[before:])
+            odd = unreadable("\n".join([found.as_markdown(), *told]))
+            assert not odd, f"people read {odd}"
             return found, builder
         finally:
             builder.hands.close()

@@ -26,7 +26,7 @@ from openant_tools.comms.servos import Servos
 from openant_tools.comms.state import BY_FACTORY, differences_of_robot, passport_registers, read_state, stopping
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.gap.measure import measure
-from openant_tools.numbers import number, percent
+from openant_tools.numbers import number, percent, span
 from openant_tools.procedure.finding import Evidence, Finding, latest
 from openant_tools.procedure.relay import relayed
 from openant_tools.procedure.step import Ask, Bench, Intent, Procedure, Progress, Say, Subroutine
@@ -55,6 +55,13 @@ GRAVITY_SHARE, LEAN_RAD, STILL_RAD_S = 0.06, math.radians(6), 0.05
 TWITCH_S = 20.0
 #: Share of steps at which an observation may be outside its measured bounds: a bound is the largest of many motions.
 OUTSIDE_SHARE = 0.01
+#: signal of an observation → how it is called before its joint or axis, and its unit
+OBSERVED = {
+    "pos": ("angle of", "rad"),
+    "vel": ("speed of", "rad/s"),
+    "gyro": ("turn rate about", "rad/s"),
+    "acc": ("acceleration along", "m/s²"),
+}
 #: A joint's simulation error that was this much smaller when the model was made.
 GAP_FACTOR, GAP_RAD = 1.8, 0.004
 START_LIST = (
@@ -128,7 +135,7 @@ def check(bench: Bench) -> Procedure:
     problems += yield from _of_this_computer(run)
     problems += _warm_or_weak(now, config)
     for joint, one in now.items():
-        then = baseline[joint].friction_nm if joint in baseline else None
+        then = number(baseline[joint].friction_nm if joint in baseline else None, "N·m")
         evidence.append(Evidence(f"friction of {joint}", _measured(one.friction_nm), "N·m", f"slow sweep; then {then}"))
     try:
         twitch = yield from _twitch(bench)
@@ -141,11 +148,10 @@ def check(bench: Bench) -> Procedure:
         problems += yield from _against_model(bench, twitch, evidence, unsure, named)
         outside = _outside(twitch, config)
         for name, share in outside.items():
-            low, high = config.observation[name]
-            yield Say(
-                f"{name} was outside its bounds {number(low)} … {number(high)} for {percent(share, decimals=0)} of the twitch",
-                "warn",
-            )
+            signal, _, joint = name.partition(".")
+            words, unit = OBSERVED[signal]
+            within = span(*config.observation[name], unit)
+            yield Say(f"{words} {joint} left {within} for {percent(share)} of the twitch", "warn")
     for line in BEFORE_A_SESSION:
         yield Say(line)
     return _finding(
@@ -183,7 +189,9 @@ def unjudged(before: Mapping[str, JointSweep], now: Mapping[str, JointSweep]) ->
                 found = "was not measured" if value is None else f"of {number(value, 'N·m', decimals=3)} cannot be"
                 words.append(f"{joint}: cannot judge its {what}, because a {what} {found} → check again")
         if new.temperature_c is None or new.volts is None:
-            words.append(f"{joint}: cannot judge its supply and temperature, because it did not tell them → its cable")
+            words.append(
+                f"{joint}: cannot judge its supply and temperature, because it did not report them → check its cable"
+            )
     return words
 
 
@@ -454,7 +462,7 @@ def _against_model(
         if joint not in before
     ]
     return [
-        f"{joint}: moves differently from its model ({number(off, 'rad', name='error', decimals=1)}, it was {number(1e3 * was, decimals=1)}) → screws, gear, or a "
+        f"{joint}: moves differently from its model ({number(off, 'rad', name='error', decimals=1)}, it was {number(was, 'rad', name='error', decimals=1)}) → screws, gear, or a "
         "part that was exchanged; `openant gap diagnose` says more"
         for joint, off in now.items()
         if (was := before.get(joint)) is not None
@@ -485,7 +493,7 @@ def _finding(
         if problems
         else f"{len(unsure)} thing{'s' if len(unsure) > 1 else ''} could not be judged"
         if unsure
-        else "as the passport has it",
+        else "nothing has changed since the passport",
         tuple(evidence),
         ""
         if not (problems or unsure)

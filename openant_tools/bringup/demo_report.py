@@ -19,11 +19,12 @@ from openant_tools.bringup.gait import walks, walks_at
 from openant_tools.bringup.robot_picture import robot_picture
 from openant_tools.bringup.tracking import Moment, draw_moment, worst_moment
 from openant_tools.files import write_bytes
-from openant_tools.numbers import number, percent
+from openant_tools.numbers import number, percent, span
 from openant_tools.recording.tables import read_run
 from openant_tools.report import Figure, KeyFigure, Mark, Picture, Report, ReportSummary, Table, Text, plots
 from openant_tools.report.parts import Tone
 from openant_tools.robot.registers import PWM_FULL
+from openant_tools.sysid.kinds import said
 from openant_tools.virtual.scenario import load_scenario
 
 if TYPE_CHECKING:
@@ -198,7 +199,7 @@ def write_report(demo: Demo) -> dict[str, Any]:
         _keep(demo, "settings", _settings_figure(rows)),
         "Every setting of the virtual robot, relative to its data sheet: what is true, and the fit's 95 % interval.",
     )
-    columns = ["parameter", "data sheet", "true", "found", "from", "to", "unit", "inside"]
+    columns = ["parameter", "data sheet", "true", "found", "95 % interval", "inside"]
     report.details("All values", Table(columns, [_row(row) for row in rows]), Text(_explained(rows)))
     if curve is not None:
         assert walking is not None
@@ -400,13 +401,13 @@ def _stood_still(walking: Mapping[str, Any]) -> str:
 def _row(row: Recovered) -> Sequence[object]:
     tone: Tone = "good" if row.inside else "bad"
     mark = Mark("yes" if row.inside else "no", tone) if row.determined else Mark(row.verdict)
-    numbers = (row.given, row.truth, row.value, row.low, row.high)
-    return [row.name, *("" if value is None else number(value) for value in numbers), row.unit, mark]
+    numbers = (row.given, row.truth, row.value)
+    return [said(row.name), *(number(value, row.unit) for value in numbers), span(row.low, row.high, row.unit), mark]
 
 
 def _explained(rows: Sequence[Recovered]) -> str:
     words = "Friction is the gear's and what the firmware's cutting of its PWM to whole counts adds, half a count on average."
-    open_ = [row.name for row in rows if not row.determined]
+    open_ = [said(row.name) for row in rows if not row.determined]
     if open_:
         words += (
             "\n\nNot to be told from these recordings, and left as they were: "

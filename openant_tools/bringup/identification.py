@@ -16,6 +16,7 @@ from openant_tools.procedure.step import Bench, Intent, Procedure, Say
 from openant_tools.procedure.unfinished import Parts
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.folder import NOMINAL_MODEL
+from openant_tools.sysid.kinds import said
 from openant_tools.sysid.protocols import protocols
 from openant_tools.sysid.record import record_takes, takes
 
@@ -29,7 +30,6 @@ RECORD_S = 16.0
 RECORDED = 0.3
 #: what is recorded, in order; the fit, which asks nobody, follows
 TAKES = ("the motion to fit", "another to judge by", "the same again", "fit")
-TIMES = ("", "once", "twice", "three times")
 
 
 def identification(bench: Bench) -> Procedure:
@@ -52,8 +52,10 @@ def identification(bench: Bench) -> Procedure:
     for take in missing:
         take.path.unlink(missing_ok=True)  # cut short
     if missing:
-        much = f"{TIMES[len(missing)]} for {number(RECORD_S, 's', decimals=0)}"
-        yield Intent(f"play `{PROTOCOL}` {much} on the stand, legs free, and fit the model to what is seen", moves=True)
+        much = f"{len(missing)} × {number(RECORD_S, 's', decimals=0)}"
+        yield Intent(
+            f"move all joints on the stand, legs free, {much}, then adjust the simulation to the recordings", moves=True
+        )
         recording = record_takes(
             engine_config(bench, imu=None),
             missing,
@@ -72,12 +74,12 @@ def identification(bench: Bench) -> Procedure:
     closer = bool(best.accepted)
     shown = bench.folder.path / "fit"
     sysid.report(result, shown, robot=bench.folder.path)
-    beside = f" with {' and '.join(sorted({name for name, _ in richer.effects_found}))} beside it" if richer else ""
+    beside = f", with {' and '.join(sorted({said(name) for name, _ in richer.effects_found}))} added" if richer else ""
     return Finding(
         "identify",
         False if not closer else None if result.doubt else True,
-        f"error on a motion it has not seen: {number(1e3 * best.before.full, decimals=2)} → {number(best.after.full, 'rad', name='error', decimals=2)}{beside} "
-        f"(floor {number(1e3 * best.floor, decimals=2)})",
+        f"error on a motion it has not seen: {number(1e3 * best.before.full, decimals=2)} → {number(best.after.full, 'rad', name='error', decimals=2)}{beside}; "
+        f"no model could beat {number(best.floor, 'rad', name='floor', decimals=2)}",
         (
             Evidence("error before", best.before.full, "rad", "nominal model, held-out recording, full run"),
             Evidence(

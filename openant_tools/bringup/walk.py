@@ -156,7 +156,7 @@ WALK: Mapping[str, Step] = {
         Step(
             "identify",
             "Identification",
-            "Record excitations and fit a calibrated model to them.",
+            "Move every joint, record it, and adjust the simulation until it moves alike.",
             "openant_tools.bringup.identification:identification",
             needs=("zeros", "bounds"),
             table="the robot on its stand",

@@ -148,11 +148,13 @@ def arena(bench: Bench) -> Procedure:
     config = bench.folder.config()
     where: str | int = bench.camera if bench.camera is not None else config.ports.camera
     if where == "":
-        named = yield Ask("Which camera? (a number, or what OpenCV opens; empty: none)", unit="text", default="")
+        named = yield Ask(
+            "Which camera? Its number (0 is the first), an address, or empty for none", unit="text", default=""
+        )
         where = named if isinstance(named, str) else ""
     if where == "":
         return Finding(
-            "arena", True, "there is no camera; the robot learns without an arena in simulation only", (),
+            "arena", True, "No camera: agents can be trained in simulation only", (),
             "name a camera with --camera and run it again before learning on the robot", COMMAND,
             problems=("no camera → floor experiments on the robot need one",),
         )  # fmt: skip
@@ -311,7 +313,7 @@ def _view(bench: Bench, config: RobotConfig, where: str | int, parts: Parts) -> 
     origin_id, body_id = config.camera.origin_tag_id, config.camera.body_tag_id
     if origin_id not in seen:
         raise HardwareFault(
-            f"the origin's tag {origin_id} ({config.camera.tag_family}) is not in the picture (seen: {sorted(seen) or 'none'})",
+            f"the origin's tag {origin_id} ({config.camera.tag_family}) is not in the picture (seen: {', '.join(map(str, sorted(seen))) or 'none'})",
             where=str(where), remedy="lay it flat into view; is the family right, the light even, the picture sharp?",
         )  # fmt: skip
     others = sorted(id for id in seen if id != origin_id)

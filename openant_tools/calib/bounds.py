@@ -278,7 +278,7 @@ def _by_hand(bus: Bus, servos: Servos, joints: Sequence[str], parts: Parts) -> S
             if way == towards and way:
                 extreme = angle
             both = seen.high > 0.1 and seen.low < -0.1
-            mark = ("both ends seen" if both else "the other end, too") + (", seam crossed" if track.seam else "")
+            mark = "both ends seen" if both else "now to the other end"
             limit = ANGLE_LIMIT_RAD[JOINTS[joint].kind]
             enough = yield Live(
                 {joint: angle}, "rad", "range by hand; Enter where it goes no further", {joint: -limit}, {joint: limit},

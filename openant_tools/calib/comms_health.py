@@ -54,7 +54,7 @@ def comms_health(bench: Bench) -> Procedure:
         host = bus.clock.lateness.words or "answers came late"
         yield Progress(0.5, "as fast as it goes")
         rate = measure_rate(bus, servos.ids, 2.0)
-        yield Progress(0.8, "the quiet that is needed between a write and a read")
+        yield Progress(0.8, "the pause that is needed between writing and reading")
         trials, gap = measure_gap(bus, servos.ids)
         busy = bus.clock.lateness.busy
     if missed:
@@ -106,7 +106,7 @@ def comms_health(bench: Bench) -> Procedure:
                 if rate.believable
                 else []
             ),
-            Evidence("quiet after a write", gap, "s", f"{trials[0].tries} reads for each gap"),
+            Evidence("pause needed between writing and reading", gap, "s", f"{trials[0].tries} reads for each gap"),
         ),
         "mend what is listed and run it again" if problems else "",
         COMMAND,

@@ -79,7 +79,8 @@ def estop(bench: Bench) -> Procedure:
     with opened_bus(bench, baud) as bus:
         left = [one.id for one in seen if bus.read(one.id, 64, 1) != b"\0"]
     yield Say(
-        "killed: its guardian switched torque off" if not left else f"id {left} kept torque", "fail" if left else "ok"
+        "killed: its guardian switched torque off" if not left else f"id {', '.join(map(str, left))} kept torque",
+        "fail" if left else "ok",
     )
     problems = [f"{joint} kept torque after the stop key" for joint, value in off.items() if value]
     problems += [f"id {id} kept torque after its program was killed" for id in left]

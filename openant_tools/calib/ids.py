@@ -143,8 +143,11 @@ def _one(
         servos.write_counts("return_delay_time", motor.joint, 0)
         servos = _rename_to(bench, bus, servos, motor, config)
         values = {name: servos.read_counts(name, motor.joint) for name in wanted}
-    if values != wanted:
-        return _Wrong(f"{motor.joint}: reads back {values} instead of {wanted} → power it off and on and try again")
+    for name, count in wanted.items():
+        if values[name] != count:
+            return _Wrong(
+                f"{motor.joint}: {name} reads {values[name]}, {count} was written → power it off and on and try again"
+            )
     yield from nudge(bench, servos[motor.joint], config.bus.baud)
     if (
         yield Ask(

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.calib.gyro_scale import HAND_RAD, KNOWN, GyroScale, by_hand, old_rates
+from openant_tools.calib.gyro_scale import GyroScale, by_hand, old_rates
 from openant_tools.calib.wires import SETTLE_S, opened_imu, wait
 from openant_tools.comms import msp
 from openant_tools.comms.clock import Clock
@@ -230,11 +230,9 @@ def imu(bench: Bench) -> Procedure:
             "wrong poses, or it was turned to the right"
         )
     elif gyro is None:
-        steps = " or ".join(KNOWN)
         unsure.append(
-            f"gyro scale: turns of 90° and 180° read {read}, which no sensor of {steps} a step makes of a turn that ended "
-            f"within {number(HAND_RAD, 'rad', decimals=1)} → turn it against a table's edge, from side to side, or let `openant calib "
-            "arena` measure it against the tag"
+            f"gyro scale: turns of 90° and 180° read {read}, which fits neither gyro type (±2000 °/s in steps of 61 or 70 mdps) → turn it "
+            "again along a table's edge, from side to side, or let `openant calib arena` measure it against the tag"
         )
     elif abs(gyro.counts_per_dps / info.gyro_lsb_per_dps - 1) > 1e-3:
         words = f"the gyro has {gyro.words}, not {number(info.gyro_lsb_per_dps, decimals=2)}: a quarter turn read {number(turned, 'rad', decimals=0)}"

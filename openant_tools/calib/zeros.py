@@ -105,6 +105,12 @@ class TorsoAnswer:
             return "another"
         return "confirmed" if self.cosine < 0 else "contradicted"
 
+    @property
+    def words(self) -> str:
+        """The verdict as it is read."""
+        other = {"unseen": "not visible", "another": "another leg", "contradicted": "the leg went the other way"}
+        return other.get(self.verdict, self.verdict)
+
 
 def torso_answer(joint: str, gyro: Array, rate: Array) -> TorsoAnswer:
     """What the gyro (n, 3), rad/s in the body's frame, says of a nudge in which `joint` turned at `rate` (n,), rad/s.
@@ -333,7 +339,7 @@ def _spline(joint: str, seen: Straight, direction: int) -> list[str]:
     return [
         f"{joint}: its horn is on the wrong spline, {abs(seen.eighths)} × 45° {'beyond' if seen.eighths > 0 else 'before'} where "
         "it belongs → its zero follows in robot.toml"
-        + (", and it runs in extended position mode since its range crosses the encoder's seam" if seam else "")
+        + (", and it runs in extended position mode since its range passes the encoder's 0°/360° point" if seam else "")
         + "; the guide's mounting is better"
     ]
 
@@ -391,7 +397,7 @@ def _nudge_all(bench: Bench, joints: tuple[str, ...]) -> Subroutine[_Nudged]:
         if math.isfinite(answer.share):
             evidence.append(
                 Evidence(
-                    f"torso's turn at {joint}", answer.share, "share", f"of the joint's, by the gyro: {answer.verdict}"
+                    f"torso turned against the nudge of {joint}", -answer.share, "share", f"by the gyro: {answer.words}"
                 )
             )
         if board_known and answer.verdict in ("contradicted", "another"):

@@ -218,7 +218,7 @@ def bench(
     )
     click.echo("quiet time after a write → failed reads")
     for trial in trials:
-        click.echo(f"  {number(1e3 * trial.gap_s, 'ms', decimals=1):>7}   {trial.failed:2d} of {trial.tries}")
+        click.echo(f"  {number(1e3 * trial.gap_s, 'ms', decimals=1):>7}   {trial.failed:2} of {trial.tries}")
     click.echo(f"smallest loss-free gap: {'none of these' if gap is None else number(1e3 * gap, 'ms', decimals=1)}")
     if json_file:
         content = {

@@ -94,7 +94,7 @@ def _on_the_bus(
 
     from rich.console import Console
 
-    from openant_tools.comms.soak import THIN_S
+    from openant_tools.comms.soak import SWING_RAD, THIN_S
     from openant_tools.comms.soak import soak as soak_bus
     from openant_tools.errors import BadInput
     from openant_tools.files import json_text, write_text
@@ -114,7 +114,7 @@ def _on_the_bus(
         )
         if not still:
             console.print(
-                f"all {len(config.servos)} joints swing by up to 0.25 rad; the robot must be on its stand, legs free"
+                f"all {len(config.servos)} joints swing by up to {number(SWING_RAD, 'rad', decimals=0)}; the robot must be on its stand, legs free"
             )
             may_move(yes, remedy="add --yes if it may, or --still")
         shown = stack.enter_context(progress_bar("soaking", console=console))

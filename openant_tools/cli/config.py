@@ -185,7 +185,7 @@ def _source(entry: Provenance | None) -> str:
     if entry.date:
         parts.append(f"on {entry.date:%Y-%m-%d}")
     if entry.low is not None and entry.high is not None:
-        parts.append(f"({span(entry.low, entry.high)})")
+        parts.append(f"({span(entry.low, entry.high, 'rad')})")
     return " ".join(parts)
 
 
@@ -219,7 +219,7 @@ def _print(folder: RobotFolder, configuration: RobotConfig) -> None:
             motor.joint,
             str(motor.id),
             motor.model,
-            f"{motor.direction:+d}",
+            number(motor.direction, sign=True),
             _degrees(motor.zero_offset_rad),
             f"{_degrees(motor.min_rad)} … {_degrees(motor.max_rad)}",
             _source(configuration.provenance_of(f"motors.{motor.joint}.zero_offset_rad")),

@@ -9,7 +9,7 @@ import click
 
 from openant_tools.cli.options import POSITIVE, Number, json_option
 from openant_tools.errors import BadInput
-from openant_tools.numbers import exact, number, percent
+from openant_tools.numbers import exact, number, percent, typed
 
 if TYPE_CHECKING:
     from openant_tools.robot.servo_gains import Beside, Conversion
@@ -32,7 +32,7 @@ class Counts(click.ParamType):  # type: ignore[type-arg]  # generic from click 8
             share = Number().convert(value, param, ctx)
             remedy = "give it a whole number, as the register holds it"
             if option == "--pwm-limit" and 0 < share <= 1:
-                remedy = f"it counts to {PWM_FULL}: for {percent(share)} give {round(share * PWM_FULL)}"
+                remedy = f"it counts to {PWM_FULL}: for {percent(share)} give {number(share * PWM_FULL, decimals=0)}"
             raise BadInput(f"{option} {value} is no count", remedy=remedy) from None
 
 
@@ -187,7 +187,7 @@ def _show(result: Conversion, origins: dict[str, str]) -> None:
 
 def _for_mjcf(value: float) -> str:
     """With the digits that are worth typing into a model."""
-    return f"{value:.4g}"  # for a file
+    return typed(value, 4)
 
 
 def _show_constants(result: Conversion) -> None:

@@ -34,22 +34,24 @@ def compare(a: str, b: str, robot: Path | None, json_file: Path | None, report: 
     """
     from openant_tools.cli.hardware import robot_of
     from openant_tools.files import json_text, write_text
+    from openant_tools.sysid.compare import chance
     from openant_tools.sysid.compare import compare as compared
     from openant_tools.sysid.compare_sources import snapshot
+    from openant_tools.sysid.kinds import said
 
     folder = robot_of(robot, needed=False)
     result = compared(snapshot(a, folder), snapshot(b, folder))
-    width = max(len(change.name) for change in result.changes)
-    click.echo(f"{'':{width}}  {'A':>10}  {'B':>10}  {'B − A':>10}  95 % interval")
+    width = max(len(said(change.name)) for change in result.changes)
+    click.echo(f"{'':{width}}  {'A':>15}  {'B':>15}  B − A (95 % interval)")
     for change in result.changes:
-        line = f"{change.name:{width}}  {number(change.a.value):>10}  {number(change.b.value):>10}  "
+        a, b = (number(one.value, one.unit or change.unit) for one in (change.a, change.b))
+        line = f"{said(change.name):{width}}  {a:>15}  {b:>15}  "
         if change.status == "not comparable":
-            click.echo(f"{line}{'–':>10}  {change.why}")
+            click.echo(f"{line}– {change.why}")
             continue
-        p = f"p {number(change.p_holm)}" if change.status == "changed" else ""
-        said = "changed" if change.status == "changed" else ""
-        interval = f"({number(change.low, sign=True)} to {number(change.high, sign=True)}) {change.unit}"
-        click.echo(f"{line}{number(change.difference, sign=True):>10}  {interval:28} {said} {p}".rstrip())
+        difference = number(change.difference, change.unit, change.low, change.high, sign=True)
+        changed = f"changed, p {chance(change.p_holm)}" if change.status == "changed" else ""
+        click.echo(f"{line}{difference:42} {changed}".rstrip())
     for note in result.notes:
         click.echo(note)
     click.echo(result.sentence)

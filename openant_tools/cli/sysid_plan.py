@@ -163,6 +163,8 @@ def plan(
 
 
 def _print(result: Plan) -> None:
+    from openant_tools.sysid.kinds import said
+
     for one in result.forecasts:
         protocol = one.protocol
         heading = f" at {number(protocol.heading_rad, 'rad', decimals=0)}" if protocol.heading_rad else ""
@@ -179,15 +181,17 @@ def _print(result: Plan) -> None:
             f"of {number(fast.no_load_rad_s, 'rad/s', decimals=0)}; {strong.joint} {percent(strong.saturated)} at its torque limit, largest "
             f"{number(max(peak.torque_nm for peak in one.peaks), 'N·m', decimals=2)}; nearest to itself {near}{moves}"
         )
-    width = max(len(one.name) for one in result.expectations)
-    click.echo(f"{'':{width}}  {'expected':>9}  {'95 % interval':21}  {'prior':21}")
+    width = max(len(said(one.name)) for one in result.expectations)
+    click.echo(f"{'':{width}}  {'expected':>15}  {'95 % interval':28}  {'prior':28}")
     for value in result.expectations:
         tied = (
-            f" {value.tied_to} ({number(value.correlation, sign=True, decimals=2)})" if value.verdict == "tied" else ""
+            f" to {said(value.tied_to)} ({number(value.correlation, sign=True, decimals=2)})"
+            if value.tied_to and value.verdict == "tied"
+            else ""
         )
         click.echo(
-            f"{value.name:{width}}  {number(value.nominal):>9}  {span(value.low, value.high):21}  "
-            f"{span(value.prior_low, value.prior_high):21}  {value.unit:10} {value.verdict}{' to' if tied else ''}{tied}"
+            f"{said(value.name):{width}}  {number(value.nominal, value.unit):>15}  {span(value.low, value.high, value.unit):28}  "
+            f"{span(value.prior_low, value.prior_high, value.unit):28}  {value.verdict}{tied}"
         )
     counts = {
         verdict: sum(one.verdict == verdict for one in result.expectations)

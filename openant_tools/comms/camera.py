@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from openant_tools.comms.clock import Clock
 from openant_tools.comms.mjpeg import MjpegStream
 from openant_tools.errors import BadInput, HardwareFault
-from openant_tools.numbers import number
+from openant_tools.numbers import number, typed
 from openant_tools.optional import cv2
 
 __all__ = ["Camera", "CameraInfo", "CameraSetting", "CameraSettings", "CameraStatistics", "DropCounter", "Frame"]
@@ -105,6 +105,12 @@ class CameraSetting:
         if isinstance(self.asked, str) or isinstance(self.given, str):
             return self.asked == self.given
         return abs(self.asked - self.given) <= 0.01 * abs(self.asked) + 1e-9
+
+    @property
+    def words(self) -> str:
+        """Both, for reading."""
+        given, asked = (one if isinstance(one, str) else typed(one) for one in (self.given, self.asked))
+        return f"{self.name} {given} instead of {asked}"
 
 
 @dataclass(frozen=True)
@@ -389,7 +395,7 @@ class _Capture:
         ):
             if asked is not None and not self._settings.network:
                 settings.append(CameraSetting(name, float(asked), float(given)))
-        refused = [f"{s.name} {s.given} instead of {s.asked}" for s in settings if not s.kept]
+        refused = [setting.words for setting in settings if not setting.kept]
         if refused:
             notes.append(f"The camera does not do what was asked: {', '.join(refused)}.")
         latency, source = self._latency()

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
-from openant_tools.numbers import number
+from openant_tools.numbers import exact, number
 
 __all__ = ["CharucoBoard", "Intrinsics", "calibrate"]
 
@@ -58,7 +58,9 @@ class Intrinsics:
             BadInput: no angle of view.
         """
         if not 1.0 <= degrees <= 170.0:
-            raise BadInput(f"a diagonal field of view of {degrees}°", remedy="the camera's data sheet says 55 to 90°")
+            raise BadInput(
+                f"a diagonal field of view of {exact(degrees, '°')}", remedy="the camera's data sheet says 55 to 90°"
+            )
         f = math.hypot(width, height) / (2.0 * math.tan(math.radians(degrees) / 2.0))
         return cls(width, height, f, f, (width - 1) / 2.0, (height - 1) / 2.0, source="declared field of view")
 

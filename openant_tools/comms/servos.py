@@ -97,7 +97,10 @@ class Servos:
         self.ids = tuple(servo.id for servo in self.servos)
         self._goals = SyncWriteTemplate(116, "i", self.ids)
         if len(set(self.ids)) != len(self.ids):
-            raise BadInput(f"two servos share an id: {sorted(self.ids)}", remedy="give each servo an id of its own")
+            raise BadInput(
+                f"two servos share an id: {', '.join(map(str, sorted(self.ids)))}",
+                remedy="give each servo an id of its own",
+            )
         self.bus.names = {servo.id: servo.joint for servo in self.servos}
 
     def __getitem__(self, joint: str) -> Servo:

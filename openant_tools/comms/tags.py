@@ -35,7 +35,7 @@ from openant_tools.comms.doubts import View, other_reading
 from openant_tools.comms.intrinsics import Intrinsics
 from openant_tools.comms.tag_family import load_family
 from openant_tools.errors import BadInput
-from openant_tools.numbers import number
+from openant_tools.numbers import exact, number
 from openant_tools.optional import cv2
 
 __all__ = ["BodyLost", "BodyPose", "BodyTracker", "Sighting", "TagDetector", "TagSetup", "tag_pose"]
@@ -127,7 +127,9 @@ class TagSetup:
             raise BadInput(f"origin and body cannot both be tag {self.body_id}", remedy="give the body another tag")
         for name, size in (("origin", self.origin_size), ("body", self.body_size)):
             if not 0.005 <= size <= 1.0:
-                raise BadInput(f"the {name} tag's edge length is {size} m", remedy="measure it; most are 0.03 to 0.2 m")
+                raise BadInput(
+                    f"the {name} tag's edge length is {exact(size, 'm')}", remedy="measure it; most are 0.03 to 0.2 m"
+                )
 
 
 @dataclass(frozen=True)

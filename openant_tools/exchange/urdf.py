@@ -217,7 +217,7 @@ def _geom(writing: _Writing, link: etree._Element, geom: int, anchor: Array) -> 
             _origin(element, place + turn.apply(at), turn)
             etree.SubElement(etree.SubElement(element, "geometry"), shape, words)
             if tag == "visual":
-                name = f"rgba_{'_'.join(f'{round(255 * part)}' for part in rgba)}"
+                name = f"rgba_{'_'.join(f'{round(255 * part)}' for part in rgba)}"  # for a file
                 etree.SubElement(etree.SubElement(element, "material", name=name), "color", rgba=_n(*rgba))
 
 

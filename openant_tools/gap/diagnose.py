@@ -206,7 +206,7 @@ def _asked(
     experiment: Experiment, model: Path, runs: Sequence[Run], hold_out: Sequence[Run], prior: Sequence[str]
 ) -> str:
     """What a diagnosis follows from: the code, models as they are compiled, joints, all that runs hold, and what is expected."""
-    state = hashlib.sha256(f"{code()} {model} {experiment.parts.joints} {list(prior)}".encode())
+    state = hashlib.sha256(f"{code()} {model} {experiment.parts.joints} {list(prior)}".encode())  # for a file
     for part in experiment.parts.runs:
         compiled = np.empty(mujoco.mj_sizeModel(part.plant.model), np.uint8)
         mujoco.mj_saveModel(part.plant.model, None, compiled)

@@ -13,11 +13,15 @@ from openant_tools.gap.protocol import RunSet
 from openant_tools.gap.tolerance import FACTORS, FLOOR, STAMP_S, tolerance_of, torso_kg
 
 __all__ = [
-    "BODY", "BRISTLE", "BRISTLE_RAD", "HEAT_LOSS", "LESS", "ONE_SIDED", "TILTS", "UNWRITTEN", "Nuisance", "adjust", "nuisances",
+    "AMOUNTS", "BODY", "BRISTLE", "BRISTLE_RAD", "HEAT_LOSS", "LESS", "ONE_SIDED", "TILTS", "UNWRITTEN", "Nuisance", "adjust", "nuisances",
 ]  # fmt: skip
 
 #: what tilts a floor along its x and y, rad
 TILTS = ("tilt_x", "tilt_y")
+#: what is added where it moves, and its unit; all else is a factor
+AMOUNTS = {"coulomb_friction": "N·m", "zero_offset": "rad", "delay": "s", "torso_kg": "kg"} | dict.fromkeys(
+    TILTS, "rad"
+)
 #: what a warm motor loses, and °C between runs from which it is asked how much; what of a servo is less by it
 HEAT_LOSS, WARMED_C, LESS = "heat_loss", 2.0, ("stiffness", "torque_limit")
 #: whose calibration it is that belongs to no joint

@@ -14,6 +14,7 @@ from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.apply import robot_of
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis
+from openant_tools.gap.nuisance import AMOUNTS
 from openant_tools.gap.regime import Regime
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.words import (
@@ -37,6 +38,7 @@ from openant_tools.recording.run import Run
 from openant_tools.report import Figure, KeyFigure, Report, ReportSummary, Table, plots
 from openant_tools.robot.joints import JOINTS
 from openant_tools.sysid.identify import joints_in_common
+from openant_tools.sysid.kinds import said
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -152,7 +154,15 @@ def _details(report: Report, found: Diagnosis) -> None:
     if found.where:
         report.details("Where the gap lies, all of it", _all_places(found))
     if found.calibration:
-        moved = [[kind, joint, value] for kind, values in found.calibration.items() for joint, value in values.items()]
+        moved = [
+            [
+                said(kind.removesuffix("_kg")),
+                joint,
+                number(value, AMOUNTS[kind], sign=True) if kind in AMOUNTS else f"× {number(value)}",
+            ]
+            for kind, values in found.calibration.items()
+            for joint, value in values.items()
+        ]
         report.details(
             "What moved as far as robots of one build differ", Table(["quantity", "joint", "factor or amount"], moved)
         )

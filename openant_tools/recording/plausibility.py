@@ -169,7 +169,7 @@ def _time_problems(t: Array, where: str) -> Iterator[BadInput]:
         row = int(back[0]) + 1
         how = "repeats" if t[row] == t[row - 1] else "runs backwards"
         yield BadInput(
-            f"time {how}: t = {float(t[row])!r} s after {float(t[row - 1])!r} s",
+            f"time {how}: t = {typed(t[row], 12)} s after {typed(t[row - 1], 12)} s",
             where=f"{where}, column t, row {row + 1}",
             remedy="sort the rows by time and keep one of each",
         )

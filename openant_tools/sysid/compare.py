@@ -21,8 +21,9 @@ from typing import Any, Literal
 from openant_tools.errors import BadInput
 from openant_tools.numbers import exact, number
 from openant_tools.sysid.intervals import TWO_SIDED_95
+from openant_tools.sysid.kinds import said
 
-__all__ = ["FAMILY_ERROR", "Change", "Comparison", "Estimate", "Snapshot", "compare", "holm"]
+__all__ = ["FAMILY_ERROR", "Change", "Comparison", "Estimate", "Snapshot", "chance", "compare", "holm"]
 
 #: probability that anything at all is called changed where nothing has
 FAMILY_ERROR = 0.05
@@ -128,7 +129,7 @@ class Comparison:
         """What to take away."""
         if not self.changed:
             return f"Nothing changed beyond chance, of {len(self.compared)} parameters compared."
-        shown = ", ".join(f"{c.name} ({_percent(c)})" for c in self.changed)
+        shown = ", ".join(f"{said(c.name)} ({_percent(c)})" for c in self.changed)
         where = f" at {', '.join(self.joints_changed)}" if self.joints_changed else ""
         return f"Changed beyond chance{where}: {shown}; {len(self.compared)} parameters were compared."
 
@@ -208,6 +209,11 @@ def compare(a: Snapshot, b: Snapshot) -> Comparison:
     )
 
 
+def chance(p: float) -> str:
+    """A probability of such a difference by chance, as it is read."""
+    return "below 0.001" if p < 1e-3 else number(p, decimals=3)
+
+
 def holm(p: Sequence[float]) -> list[float]:
     """Probabilities adjusted by Holm's step-down procedure, which asks nothing of how the tests hang together."""
     order = sorted(range(len(p)), key=lambda k: p[k])
@@ -285,7 +291,7 @@ def _notes(a: Snapshot, b: Snapshot, changes: Sequence[Change]) -> tuple[str, ..
             f"Both rest on {', '.join(shared)}: their errors are not independent, so that differences look surer or less sure "
             "than they are."
         )
-    tempting = [c.name for c in changes if c.status == "same" and c.p < FAMILY_ERROR]
+    tempting = [said(c.name) for c in changes if c.status == "same" and c.p < FAMILY_ERROR]
     if tempting:
         notes.append(
             f"{', '.join(tempting)} would differ if looked at alone (p < {exact(FAMILY_ERROR)}); among so many parameters that is "

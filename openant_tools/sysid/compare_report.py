@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from openant_tools.numbers import number, percent, readable
 from openant_tools.report import Figure, KeyFigure, Mark, Report, ReportSummary, plots
 from openant_tools.report.parts import Tone
-from openant_tools.sysid.compare import FAMILY_ERROR, Change, Comparison, Estimate
+from openant_tools.sysid.compare import FAMILY_ERROR, Change, Comparison, Estimate, chance
 from openant_tools.sysid.kinds import said
 
 if TYPE_CHECKING:
@@ -52,8 +52,8 @@ def comparison_report(result: Comparison) -> Report:
         ["parameter", "A", "B", "B − A (95 % interval)", "p (Holm)", "verdict"],
         [
             [
-                change.name, number(change.a.value, change.unit), number(change.b.value, change.unit),
-                number(change.difference, change.unit, change.low, change.high, sign=True), _chance(change.p_holm),
+                said(change.name), number(change.a.value, change.unit), number(change.b.value, change.unit),
+                number(change.difference, change.unit, change.low, change.high, sign=True), chance(change.p_holm),
                 Mark(change.status, _TONE[change.status]),
             ]
             for change in result.changes
@@ -66,11 +66,11 @@ def comparison_report(result: Comparison) -> Report:
     report.figure(dots(result.changes), "The same of all parameters.")
     remarks = [
         *result.notes,
-        *dict.fromkeys(f"{change.name}: {change.why}." for change in result.changes if change.why),
+        *dict.fromkeys(f"{said(change.name)}: {change.why}." for change in result.changes if change.why),
     ]
     for names, whose in ((result.only_a, "A"), (result.only_b, "B")):
         if names:
-            remarks.append(f"Only in {whose}: {', '.join(names)}.")
+            remarks.append(f"Only in {whose}: {', '.join(map(said, names))}.")
     if remarks:
         report.section("Remarks").text("\n".join(f"- {remark}" for remark in remarks))
     return report
@@ -81,10 +81,6 @@ def _telling(result: Comparison) -> Sequence[Change]:
     shown = result.changed or sorted(result.compared, key=lambda change: change.p)[:1] or result.changes
     kinds = {change.kind for change in shown}
     return [change for change in result.changes if change.kind in kinds]
-
-
-def _chance(p: float) -> str:
-    return "below 0.001" if p < 1e-3 else number(p, decimals=3)
 
 
 def dots(changes: Sequence[Change]) -> MatplotlibFigure:
@@ -123,7 +119,7 @@ def _panel(axis: Axes, kind: str, group: Sequence[Change]) -> None:
                 text.set_fontweight("bold")
         axis.set_ylim(len(group) - 0.5, -0.5)
         axis.set_ylabel("joint" if any("." in change.name for change in group) else "")
-        axis.set_xlabel(plots.axis_label(kind.replace("_", " "), unit))
+        axis.set_xlabel(plots.axis_label(said(kind), unit))
 
 
 def _row_name(change: Change) -> str:

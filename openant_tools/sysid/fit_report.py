@@ -140,7 +140,7 @@ def _correlations(report: Report, result: Identification) -> None:
         return
     deviation = np.sqrt(np.diag(result.covariance))
     correlation = result.covariance / np.outer(deviation, deviation)
-    names = [value.name for value in result.values]
+    names = [said(value.name) for value in result.values]
     upper = np.argwhere(np.triu(np.abs(correlation) > STRONG, 1))
     pairs = sorted(upper.tolist(), key=lambda pair: -abs(correlation[pair[0], pair[1]]))[:STRONGEST]
     if not pairs:
@@ -175,7 +175,7 @@ def _sentence(result: Identification) -> str:
 
 
 def _changes(result: Identification) -> str:
-    kinds = dict.fromkeys(name.partition(".")[0].replace("_", " ") for name in result.accepted)
+    kinds = dict.fromkeys(said(name.partition(".")[0]) for name in result.accepted)
     return f"It changes {', '.join(kinds)}." if kinds else "Every value stays as it was given."
 
 
@@ -190,7 +190,7 @@ def _error(rad: float) -> str:
 def _row(value: Value) -> list[object]:
     interval = "–" if value.low is None or value.high is None else span(value.low, value.high, value.unit)
     mark = Mark(value.words, _TONE[value.verdict])
-    return [value.name, number(value.given, value.unit), number(value.value, value.unit), interval, mark]
+    return [said(value.name), number(value.given, value.unit), number(value.value, value.unit), interval, mark]
 
 
 def _error_against_horizon(result: Identification) -> MatplotlibFigure:

@@ -35,7 +35,7 @@ from openant_tools.sysid.dataset import Dataset, gaps, sensor_floor
 from openant_tools.sysid.declared import Declaration, declared_parameters
 from openant_tools.sysid.estimate import Estimate
 from openant_tools.sysid.intervals import TWO_SIDED_95
-from openant_tools.sysid.kinds import ACTUATOR_LAG, LOAD_FRICTION, SPEED_LIMIT
+from openant_tools.sysid.kinds import ACTUATOR_LAG, LOAD_FRICTION, SPEED_LIMIT, said
 from openant_tools.sysid.parameter import (
     ACTION_DELAY,
     KINDS,
@@ -146,7 +146,7 @@ class Value:
         """The verdict for reading."""
         if self.verdict == "conflict":
             return f"conflict: the prior says {span(self.prior_low, self.prior_high, self.unit)}"
-        return f"tied to {self.tied_to}" if self.tied_to else self.verdict
+        return f"tied to {said(self.tied_to)}" if self.tied_to else self.verdict
 
 
 @dataclass(frozen=True)
@@ -661,7 +661,9 @@ def _supply_notes(runs: Sequence[Run], joints: Sequence[str]) -> Iterator[str]:
 
 def _notes(estimate: Estimate, joints: Sequence[str], runs: Sequence[Run], values: Sequence[Value]) -> tuple[str, ...]:
     notes = []
-    torn = [f"{value.name} ({' and '.join(column(value.halves, value.unit))})" for value in values if value.halves]
+    torn = [
+        f"{said(value.name)} ({' and '.join(column(value.halves, value.unit))})" for value in values if value.halves
+    ]
     if torn:
         notes.append(
             f"Two halves of the data contradict each other about {', '.join(torn)}: the robot changed between them, or the "

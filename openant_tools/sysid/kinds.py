@@ -81,4 +81,5 @@ KINDS: dict[str, Kind] = {name: _found[name] for name in NAMES} | {kind.name: ki
 def said(name: str) -> str:
     """The name of a value, `zero_offset.hip_rr`, as one says it."""
     kind, _, joint = name.partition(".")
-    return f"{kind.replace('_', ' ')} of {joint}" if joint else kind.replace("_", " ")
+    words = "dry friction" if kind == "coulomb_friction" else kind.replace("_", " ")
+    return f"{words} of {joint}" if joint else words

@@ -34,7 +34,7 @@ from openant_tools.sysid.dataset import Dataset
 from openant_tools.sysid.declared import Declaration
 from openant_tools.sysid.effect_fit import brakes_alike, with_effects
 from openant_tools.sysid.identify import Identification, Progress, Value, dataset_of, identify, joints_in_common
-from openant_tools.sysid.kinds import ELECTRICAL_DAMPING
+from openant_tools.sysid.kinds import ELECTRICAL_DAMPING, said
 from openant_tools.sysid.quality import without_errors
 from openant_tools.sysid.result import stating_both, write_fit, write_robot
 from openant_tools.sysid.rules import Finding, check_runs, findings, with_rows, without_turns
@@ -362,9 +362,12 @@ def report(found: Identification, folder: File, *, robot: File | None = None) ->
 
 def summary(found: Identification) -> str:
     """What a fit found, for reading: each value with its 95 % interval, unit and verdict, the gap on held-out runs, the notes."""
-    shown = {value.name: number(value.value, value.unit, value.low, value.high) for value in found.values}
+    shown = {said(value.name): number(value.value, value.unit, value.low, value.high) for value in found.values}
     width, wide = (max(map(len, words)) for words in (shown.keys(), shown.values()))
-    lines = [f"{value.name:{width}}  {shown[value.name]:{wide}}  {value.words}" for value in found.values]
+    lines = [
+        f"{name:{width}}  {words:{wide}}  {value.words}"
+        for (name, words), value in zip(shown.items(), found.values, strict=True)
+    ]
     judged = "runs left out in turn, each with all choices made anew" if found.in_turn else "held-out runs"
     lines.append(
         f"error on {judged}, full run: {_error(found.before.full)} → {_error(found.after.full)}; "

@@ -11,6 +11,7 @@ from openant_tools.numbers import exact, number, percent, span
 from openant_tools.report import Figure, KeyFigure, Mark, Report, ReportSummary, plots
 from openant_tools.report.parts import Tone
 from openant_tools.sysid.forecast import NEAR_M, Forecast
+from openant_tools.sysid.kinds import said
 from openant_tools.sysid.plan import Expectation, Plan
 from openant_tools.sysid.verdict import TIED
 
@@ -77,7 +78,7 @@ def plan_report(plan: Plan) -> Report:
         ["parameter", "verdict", "expected (95 % interval)", "known today", "tied to"],
         [
             [
-                one.name, Mark(one.verdict, _TONE[one.verdict]),
+                said(one.name), Mark(one.verdict, _TONE[one.verdict]),
                 number(one.nominal, one.unit, one.low, one.high), span(one.prior_low, one.prior_high, one.unit),
                 _tie(one),
             ]
@@ -119,10 +120,10 @@ def _open(plan: Plan) -> list[str]:
     for one in plan.expectations:
         kind, _, label = one.name.partition(".")
         if one.verdict != "identified":
-            left.setdefault(kind.replace("_", " "), []).append(label)
-    of = {kind: sum(one.name.startswith(f"{kind.replace(' ', '_')}.") for one in plan.expectations) for kind in left}
+            left.setdefault(kind, []).append(label)
+    of = {kind: sum(one.name.startswith(f"{kind}.") for one in plan.expectations) for kind in left}
     return [
-        f"{kind} ({f'all {of[kind]}' if len(labels) == of[kind] > 1 else ', '.join(labels)})"
+        f"{said(kind)} ({f'all {of[kind]}' if len(labels) == of[kind] > 1 else ', '.join(labels)})"
         for kind, labels in left.items()
     ]
 
@@ -132,7 +133,7 @@ def _tie(one: Expectation) -> str:
     if one.tied_to is None:
         return ""
     kind, _, label = one.tied_to.partition(".")
-    name = kind if label == one.name.partition(".")[2] else one.tied_to
+    name = said(kind if label == one.name.partition(".")[2] else one.tied_to)
     return f"{name} ({number(one.correlation, sign=True, decimals=2)})"
 
 
@@ -163,7 +164,7 @@ def expected_shares(expectations: Sequence[Expectation]) -> MatplotlibFigure:
             label = "tied to another" if verdict == "tied" else verdict
             axes.plot(shares, rows, _MARKER[verdict], color=_COLOUR[verdict], label=label, alpha=0.8)
         axes.set_xscale("log")
-        axes.set_yticks(range(len(kinds)), [kind.replace("_", " ") for kind in kinds])
+        axes.set_yticks(range(len(kinds)), list(map(said, kinds)))
         axes.invert_yaxis()
         axes.axvline(1.0, linestyle=":", color=plots.INK)
         axes.xaxis.set_major_formatter(lambda share, _: percent(share, decimals=1 if share < 0.01 else 0))

@@ -91,7 +91,7 @@ def takes(
         if k:
             place = f"-{protocol.setup}"
             if protocol.heading_rad:
-                place += f"-{round(math.degrees(protocol.heading_rad))}"
+                place += f"-{round(math.degrees(protocol.heading_rad))}"  # for a file
 
         def path(what: str, place: str = place) -> Path:
             return out.with_name(f"{out.stem}{place}{what}{out.suffix}")

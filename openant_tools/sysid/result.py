@@ -28,7 +28,7 @@ from openant_tools.robot.pair import PLAIN, mark_of
 from openant_tools.sysid.effect_fit import TRIED, better, chosen_in_turn
 from openant_tools.sysid.fit_report import fit_report
 from openant_tools.sysid.identify import Identification, calibrated, restated
-from openant_tools.sysid.kinds import KINDS
+from openant_tools.sysid.kinds import KINDS, said
 from openant_tools.sysid.parameter import names_of
 
 __all__ = ["WITH_EFFECTS", "effects_beside", "pair_of", "pairs", "stating_both", "write_fit", "write_robot"]
@@ -97,7 +97,7 @@ def stating_both(plain: Identification, tried: Identification) -> Identification
     if both := chosen_in_turn(tried, plain):
         errors += f" Chosen between the two anew without each: {number(both.full, 'rad', name='gap')} and {number(both.horizon, 'rad', name='gap')}."
     found = [
-        f"{value.name} = {number(value.value, value.unit)}"
+        f"{said(value.name)} {number(value.value, value.unit)}"
         for value in tried.values
         if value.accepted and value.value and value.name.partition(".")[0] in TRIED
     ]
@@ -108,7 +108,7 @@ def stating_both(plain: Identification, tried: Identification) -> Identification
             f"openant_env, beside their own model alone; both are in {WITH_EFFECTS}, and with --robot they are the robot's."
         )
     else:
-        note = f"{errors} What plain MuJoCo has no feature for ({', '.join(TRIED)}) does not pay here: the plain model is the best."
+        note = f"{errors} What plain MuJoCo has no feature for ({', '.join(map(said, TRIED))}) does not pay here: the plain model is the best."
     winner = replace(tried, notes=(*tried.notes, errors)) if wins else None
     return replace(plain, notes=(*plain.notes, note), with_effects=winner)
 

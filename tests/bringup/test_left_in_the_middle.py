@@ -116,13 +116,11 @@ def test_motions_that_were_recorded_are_not_played_again_unless_the_robot_is_ano
             "identify",
             granted,
         )
-        assert intents[0].startswith("play `stand` three times")
+        assert intents[0].endswith("3 × 5 s, then adjust the simulation to the recordings")
         there.folder.update({"motors.knee_rr.max_rad": limit}, provenance=Provenance("measured", "a test"))
         finding, builder = there.do(identification(there.bench))
     assert finding.step == "identify"
-    assert [event.words.split(" for ")[0] for event in builder.events if isinstance(event, Intent)] == [
-        "play `stand` once"
-    ]
+    assert [event.words.split(", ")[2] for event in builder.events if isinstance(event, Intent)] == ["1 × 5 s"]
     assert {name: (there.folder.recordings / name).read_bytes() for name in recorded} == recorded
     assert unfinished(there.folder, "identify") is None
 

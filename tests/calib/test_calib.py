@@ -704,7 +704,7 @@ def test_turns_that_fit_no_sensor_are_asked_for_again_and_not_judged(tmp_path, m
     with robot(tmp_path / "ant", imu={"gyro_scale": [1.252] * 3}) as ant:
         finding, builder = ant.do(imu(ant.bench))
         assert finding.verdict == "cannot judge"
-        assert "turns of 90° and 180° read 113°, 225°, which no sensor" in finding.unsure[0]
+        assert "turns of 90° and 180° read 113°, 225°, which fits neither gyro type" in finding.unsure[0]
         assert "turn the robot half a turn" in builder.said
         kept = ant.folder.config()
         assert kept.provenance_of("imu.gyro_counts_per_dps") is None

@@ -355,7 +355,7 @@ def test_a_saved_state_goes_on_bit_for_bit_here_and_in_a_pickled_copy():
         ({"observation_order": "random"}, "no such order of observations"),
         ({"kit": "deluxe"}, "there is no kit 'deluxe'"),
         ({"on_fall": "cry"}, "on_fall is 'cry'"),
-        ({"time_limit_s": -1}, "the time limit is -1 s"),
+        ({"time_limit_s": -1}, "the time limit is −1 s"),
         ({"effects": ["load_friction"]}, "the nominal robot has no effects"),
         ({"robot": "/nowhere"}, "/nowhere: there is no robot.toml here"),
     ],

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import ast
 import math
 import re
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
-from places import ROOT
+from places import ROOT, TESTS
+from readable import unreadable
 
 from openant_tools.comms.hardware import changes
 from openant_tools.numbers import chosen, column, exact, number, percent, span, typed
@@ -58,20 +62,126 @@ def test_columns_signs_and_shares():
     ]
 
 
-#: a number formatted by hand: f"{value:.3g}", f"{share:.0%}", f"{value:+8.3f}"
-FORMATTED = re.compile(r":[-+<>^=]*[0-9]*(?:\.[0-9]+)?[gfe%]\}")
+#: formats of what is no number: of words (their width, or where they are cut), of names of files and devices, of dates
+OF_NO_NUMBER = re.compile(r"([^0-9]?[<>^])?(\d*|(\d+)\.\3)|0\d+[dx]|(%[A-Za-z].?)+")
+#: what makes a list or a number that is printed as Python has it
+AS_PYTHON = {"dict", "float", "frozenset", "list", "round", "set", "sorted", "tuple", "vars"}
+DISPLAYS = (ast.Dict, ast.DictComp, ast.List, ast.ListComp, ast.Set, ast.SetComp, ast.Tuple)
+#: after what a computer reads, such as a value in a file or a model: not in a command, whose words people read
+MARK = "# for a file"
+
+
+def _as_python(node: ast.expr, shown: set[str]) -> bool:
+    if isinstance(node, ast.BoolOp):
+        return any(_as_python(value, shown) for value in node.values)
+    called = node.func if isinstance(node, ast.Call) else None
+    return (
+        isinstance(node, DISPLAYS)
+        or (isinstance(called, ast.Name) and called.id in AS_PYTHON)
+        or (isinstance(node, ast.Name) and node.id in shown)
+    )
+
+
+def _format(spec: ast.expr | None) -> str:
+    """A format of an f-string, with 0 for what it takes from elsewhere."""
+    parts = spec.values if isinstance(spec, ast.JoinedStr) else []
+    return "".join(str(part.value) if isinstance(part, ast.Constant) else "0" for part in parts)
+
+
+def formatted(code: str) -> Iterator[ast.expr]:
+    """Where a number, a list or a dictionary becomes text otherwise than by `openant_tools.numbers`."""
+    tree = ast.parse(code)
+    for scope in [tree, *(node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef))]:
+        given: dict[str, list[ast.expr]] = {}
+        for node in ast.walk(scope) if scope is not tree else ():
+            if isinstance(node, ast.Assign):
+                for target in node.targets:
+                    given.setdefault(ast.unparse(target), []).append(node.value)
+        shown = {name for name, values in given.items() if all(isinstance(value, DISPLAYS) for value in values)}
+        for node in ast.walk(scope):
+            if isinstance(node, ast.FormattedValue):
+                found = not OF_NO_NUMBER.fullmatch(_format(node.format_spec)) or _as_python(node.value, shown)
+            elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                found = node.func.id == "format" or (
+                    node.func.id == "str" and bool(node.args) and _as_python(node.args[0], shown)
+                )
+            elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+                found = (
+                    node.func.attr == "format"
+                    and isinstance(node.func.value, ast.Constant)
+                    and ":" in node.func.value.value
+                )
+            else:
+                found = (
+                    isinstance(node, ast.BinOp)
+                    and isinstance(node.op, ast.Mod)
+                    and isinstance(node.left, ast.Constant)
+                    and isinstance(node.left.value, str)
+                )
+            if found:
+                yield node
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        'f"{x:.3g} N·m"',
+        'f"{x:,}"',
+        'f"{x:+d}"',
+        'f"{x:.{n}f}"',
+        'f"{x:{n}.2}"',
+        'f"{share:.0%}"',
+        'f"{round(x, 2)} s"',
+        'f"{float(x)!r} s"',
+        'f"{[1.0, x]}"',
+        'f"seen: {sorted(ids) or None}"',
+        'def f():\n    values = {"id": x}\n    return f"reads {values}"',
+        "str(round(x, 3))",
+        'format(x, ".3f")',
+        '"{:.1f} s".format(x)',
+        '"%.1f s" % x',
+    ],
+)
+def test_a_number_that_is_formatted_by_hand_is_seen(code):
+    assert list(formatted(code))
+
+
+@pytest.mark.parametrize(
+    "code",
+    ['f"{number(x)}"', 'f"{name:>{width}} {words:40.40} {k:03d} {crc:08x} {day:%Y-%m-%d}"', 'f"{len(x)}"', "str(path)"],
+)
+def test_words_ids_and_dates_are_no_numbers(code):
+    assert not list(formatted(code))
 
 
 def test_no_module_formats_a_number_that_people_read():
-    """What a computer reads, such as a value in a file or a model, is marked as such."""
-    found = [
-        f"{path.relative_to(ROOT)}:{number}"
-        for package in ("openant_tools", "openant_env", "openant_agents")
-        for path in sorted((ROOT / package).rglob("*.py"))
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
-        if FORMATTED.search(line) and "# for a file" not in line
-    ]
+    """What a computer reads, such as a value in a file or a model, is marked as such; a command says all of its words to people."""
+    found = []
+    for package in ("openant_tools", "openant_env", "openant_agents"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            code = path.read_text(encoding="utf-8")
+            lines, place = code.splitlines(), path.relative_to(ROOT)
+            if place == Path("openant_tools/numbers.py"):
+                continue
+            spoken = place.is_relative_to("openant_tools/cli")
+            found += [
+                f"{place}:{node.lineno}"
+                for node in formatted(code)
+                if spoken or not any(MARK in line for line in lines[node.lineno - 1 : node.end_lineno])
+            ]
     assert not found, f"print with openant_tools.numbers: {found}"
+
+
+def test_what_people_read_has_units_of_people_and_no_more_digits_than_a_measurement():
+    """As it came out: `tests/builder.py` asks this of every finding that a step makes of a virtual robot, too."""
+    assert unreadable("slow sweep; then 0.0412387612 N·m") == ["0.0412387612"]
+    assert unreadable("up to 0.25 rad, 3.1 rad/s") == ["5 rad", "1 rad"]
+    assert unreadable("reads {'id': 10}, seen: [1, 2], was None") == ["{'id':", "[1,", "None"]
+    assert not unreadable("12.0° (11.5 to 12.6), 4.72 N·m/rad, firmware 4.5.100, 192.168.100.100, run 20260101.mcap")
+    screens = sorted((TESTS / "tui" / "__snapshots__" / "test_looks").glob("*.txt"))
+    assert screens
+    found = {path.name: odd for path in screens if (odd := unreadable(path.read_text(encoding="utf-8")))}
+    assert not found
 
 
 def test_what_eight_servos_are_told_alike_is_one_line():

@@ -165,7 +165,7 @@ def test_readings_at_the_torque_limit_are_left_out(tmp_path: Path, capsys: pytes
     ("text", "message"),
     [
         ("", "has no readings"),
-        ("deflection,grams\n5.7,300\n", "line 2: a deflection of 5.7 rad → is it in degrees?"),
+        ("deflection,grams\n5.7,300\n", "line 2: a deflection of 327° → were degrees given?"),
         ("0.1,300\n0.2,many\n", "line 2: 0.2, many are no numbers"),
         ("0.1\n", "needs two columns"),
         ("0.1,nan\n", "nan g on a kitchen scale"),

@@ -704,7 +704,7 @@ def test_what_is_tied_is_named_with_the_experiment_that_unties_it(tmp_path: Path
     for one, other in (("velocity_gain", "damping"), ("damping", "velocity_gain")):
         found = value(result, f"{one}.joint")
         assert found.verdict == "tied"
-        assert found.words == f"tied to {other}.joint"
+        assert found.words == f"tied to {other.replace('_', ' ')} of joint"
         assert "saturating-steps" in found.record_next
         assert "drops" in found.record_next
         assert found.accepted

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from openant_tools.comms.dropouts.causes import CAUSES
 from openant_tools.comms.dropouts.diagnose import DropoutDiagnosis
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.intervals import wilson
@@ -56,7 +57,9 @@ def dropouts_finding(
         evidence.append(Evidence("loop late, 99 of 100", float(np.quantile(wake, 0.99)), "s", source))
     best = found.suspects[0]
     if not found.healthy_bus:
-        evidence.append(Evidence(f"probability of {best.cause}", best.probability, "share", "openant comms diagnose"))
+        evidence.append(
+            Evidence(f"probability of {CAUSES[best.cause].words}", best.probability, "share", "openant comms diagnose")
+        )
     remedy = "" if found.verdict in ("none", "unknown") else best.remedy
     steps = [words for words in (remedy, found.next_test) if words]
     marks = tuple(why.words for why in best.evidence if why.nats > 0)[:_SHOWN]

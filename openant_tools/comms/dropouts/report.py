@@ -86,7 +86,7 @@ def dropouts_report(found: DropoutDiagnosis) -> Report:
         for one in found.suspects
     ]
     rows.append(["nothing wrong", "", percent(found.healthy), ""])
-    rows.append(["something that has no name here", "", percent(found.unknown), ""])
+    rows.append(["a cause that is not in this list", "", percent(found.unknown), ""])
     report.section("Causes considered").table(["cause", "where", "probability", "what speaks for it"], rows)
     if named:
         against = [[why.words, number(why.nats, sign=True, decimals=1)] for why in best.evidence]

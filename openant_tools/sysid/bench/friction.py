@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
-from openant_tools.numbers import exact, number
+from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2
 from openant_tools.sysid.bench.readings import reading_rows
@@ -70,9 +70,9 @@ def checked(angle_rad: float, where: str) -> float:
     """The angle, or BadInput where no plate was tilted so."""
     if not 0 < angle_rad <= STEEPEST_RAD:
         raise BadInput(
-            f"a plate at {exact(angle_rad, 'rad')} ({number(angle_rad, 'rad', decimals=0)})",
+            f"a plate at {number(angle_rad, 'rad', decimals=0)}",
             where=where,
-            remedy="give its angle from level, 0 to 1 rad; write 31deg for degrees. On a steeper one the robot topples",
+            remedy="give its angle from level, at most 57°, with its unit: write 31deg. On a steeper one the robot topples",
         )
     return angle_rad
 

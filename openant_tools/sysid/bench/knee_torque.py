@@ -92,8 +92,8 @@ def knee_torque(mass_kg: float, legs: int, angle_rad: float, length_m: float = K
         raise BadInput(f"{legs} legs in stance", remedy="an Ant stands on 1 to 4")
     if not 0 <= angle_rad <= math.pi / 2 + 1e-9:
         raise BadInput(
-            f"a leg at {exact(angle_rad, 'rad')} from the vertical is above its knee",
-            remedy="0 is a leg straight down, 1.57 straight out; write 45deg for degrees",
+            f"a leg at {number(angle_rad, 'rad', decimals=0)} from the vertical is above its knee",
+            remedy="0° is a leg straight down, 90° straight out; give the angle its unit: write 45deg",
         )
     return mass_kg * GRAVITY_M_S2 / legs * length_m * math.sin(angle_rad)
 

@@ -15,7 +15,7 @@ from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.comms.servos import Servo
 from openant_tools.errors import BadInput, HardwareFault
-from openant_tools.numbers import exact, number, percent, span
+from openant_tools.numbers import number, percent, span
 from openant_tools.procedure.step import Ask, Hands, Intent, Procedure, Progress, Say, Subroutine
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import HOME_RAD
@@ -73,7 +73,9 @@ class Pressing:
                 f"no joint {self.joint!r}", remedy=f"the joints are {', '.join(s.joint for s in config.servos)}"
             )
         if not self.step_rad > 0 or self.steps < 1:
-            raise BadInput(f"{self.steps} steps of {exact(self.step_rad, 'rad')}", remedy="such as 5 steps of 0.02 rad")
+            raise BadInput(
+                f"{self.steps} steps of {number(self.step_rad, 'rad', decimals=1)}", remedy="such as 5 steps of 1.1°"
+            )
         ends = self.pose_rad, self.pose_rad + self.direction * self.deflections_rad[-1]
         low, high = config.limits_rad.get(self.joint, (-math.inf, math.inf))
         if min(ends) < low or max(ends) > high:

@@ -270,7 +270,7 @@ def decide_divisor(duty_per_rad: Line, p_gain: float, tolerance: float = 0.03) -
     """
     if not duty_per_rad.slope > 0:
         raise BadInput(
-            f"pushing harder gave less ({number(duty_per_rad.slope)} a rad)",
+            f"pushing harder gave less ({number(100 * math.radians(duty_per_rad.slope), '% of full duty')} for each degree)",
             remedy="the leg must be held by the scale: fix the torso, and push downwards",
         )
 
@@ -310,9 +310,9 @@ def checked(reading: Weighing, where: str) -> Weighing:
     """The reading, or BadInput where it cannot be meant."""
     if not abs(reading.deflection_rad) <= LARGEST_DEFLECTION_RAD:
         raise BadInput(
-            f"a deflection of {exact(reading.deflection_rad, 'rad')}",
+            f"a deflection of {number(reading.deflection_rad, 'rad', decimals=0)}",
             where=where,
-            remedy="is it in degrees? 5.73° are 0.1 rad",
+            remedy="were degrees given? A deflection is in rad: 0.1 is 5.73°",
         )
     if not abs(reading.grams) <= MOST_GRAMS:
         raise BadInput(f"{exact(reading.grams, 'g')} on a kitchen scale", where=where, remedy="readings are in grams")
