@@ -65,7 +65,7 @@ SAID: Mapping[str, tuple[Event, ...]] = {
     "number": (Ask("How long shall the legs swing? An hour finds what is rare.", unit="min", default=1.0, low=0, high=600),),
     "hands": (
         Hands("Move the rear right hip from stop to stop, twice, gently.", "turn", while_watching=True),
-        Live({"hip_rr": 0.3}, "rad", "range by hand", {"hip_rr": -0.8}, {"hip_rr": 0.8}, {"hip_rr": "the other end, too"}),
+        Live({"hip_rr": 0.3}, "rad", "range by hand", {"hip_rr": -0.8}, {"hip_rr": 0.8}, {"hip_rr": "now to the other end"}),
     ),
     "bars": (
         Live(
