@@ -224,7 +224,7 @@ def write_docs(found: Score, path: Path) -> None:
         "# The blind benchmark", "",
         "<!-- Written by `openant gap blind score SET… --docs docs/blind.md`: do not edit. -->", "",
         "Robots that nobody chose, simulated by other code than the diagnosis uses, judged before the answers are opened.", "",
-        "```sh long", *_COMMANDS, "```", "", *_drawn(found), "", *_HOW, "", "## Result", "", _origin(found), "", *table_lines(found), "",
+        "```sh elsewhere", *_COMMANDS, "```", "", *_drawn(found), "", *_HOW, "", "## Result", "", _origin(found), "", *table_lines(found), "",
     ]  # fmt: skip
     if worst:
         lines += ["Commonest confusions: " + "; ".join(f"{a} taken for {b} ({n})" for a, b, n in worst) + ".", ""]

@@ -234,7 +234,7 @@ def write_soak_docs(found: SoakScore, path: Path) -> None:
     lines = [
         "# The blind check of dropout attribution", "",
         "<!-- Written by `openant comms blind score SET --docs docs/comms-blind.md`: do not edit. -->", "",
-        "```sh long",
+        "```sh elsewhere",
         f"openant comms blind make --out SET --seed-from COMMIT --key-file KEY --soaks {facts['soaks']} "
         f"--healthy {typed(facts['mix']['healthy'], 2)} --virtual {typed(facts['mix']['virtual'], 2)}    # answers sealed",
         "openant comms blind run SET",

@@ -212,7 +212,8 @@ class Effect:
 
         vector: sizes share one magnitude in a random direction; else each is drawn by itself.
         shows: whether it can show on what was recorded.
-        signal: the signal of the log that it acts on, where that is not the motion itself.
+        signal: the signal of the log that it acts on, where that is not the motion itself. told: whether it acts on what joints tell
+            of their motion.
         silent: whether command and encoder shift alike, so that joint positions hardly show it.
         unseen: names of quantities that joint positions do not show.
         random: what happens at random times, where it does: no simulation repeats that.
@@ -238,6 +239,7 @@ class Effect:
     vector: bool = False
     shows: Callable[[Reference], bool] = everywhere
     signal: str | None = None
+    told: bool = False
     silent: bool = False
     unseen: frozenset[str] = frozenset()
     random: Chance | None = None

@@ -39,6 +39,7 @@ effect = Effect(
     enter=_enter,
     native=True,
     writer=Writer(90, joint=_write_encoder, body=_write_imu),
+    told=True,
     vector=True,
     unseen=frozenset({"vel", "imu"}),
     stated=lambda values, reference, joints: {

@@ -69,7 +69,7 @@ class Row:
     Attributes:
         causes: names, the one that is asked about last; empty for none. joints: of each cause, indices.
         fit: deviations of healthy robots by which the recording, or what the others leave of it, goes along what the cause does.
-        leads: whether it may be what leads the gap. expected: nats that its builder's word adds.
+        leads: whether it may be what leads the gap. told: whether what is asked about acts on what joints tell of their motion. expected: nats that its builder's word adds.
         support: logarithm of how much less it leaves of the gap on held-out folds, mean of them and summed over joints, than what it is compared
             with does (no further cause, or the others); None where it was not fitted, or where nothing that was recorded
             tells.
@@ -85,6 +85,7 @@ class Row:
     joints: tuple[tuple[int, ...], ...] = ()
     fit: float = 0.0
     leads: bool = True
+    told: bool = False
     expected: float = 0.0
     support: float | None = None
     foretold: float = 0.0
@@ -113,8 +114,9 @@ class Decision:
 
     Attributes:
         verdict: a cause, or NONE, AMBIGUOUS, UNEXPLAINED. confidence: that it is right. chances: of each cause, that it leads.
-        selected: rows that go into an improved model, of an ambiguous verdict the likelier one. alike: then, sets that cannot be told
-            apart.
+        selected: rows that go into an improved model, of an ambiguous verdict the likelier one, or the one that acts on the motion: a
+            policy meets what is late in what it does as in what it sees, and every engine carries that. alike: then, sets that cannot be
+            told apart.
     """
 
     verdict: str
@@ -202,6 +204,9 @@ def decide(rows: Sequence[Row], anomaly: Anomaly) -> Decision:
         either = p[named[0]] + p[named[1]]
         if any(set(named[:2]) <= set(row.causes) for row in rows):
             return Decision(named[0], either, p, (best,))
+        other = next(row for row in rows if row.causes == (named[1],))
+        if best.told and not other.told:
+            best = other
         return Decision(AMBIGUOUS, either, p, (best,), (tuple(named[:2]),))
     return Decision(verdict, p[verdict], p, (best,))
 

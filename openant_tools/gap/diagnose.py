@@ -139,7 +139,7 @@ def hypotheses(experiment: Experiment, prior: Sequence[str], progress: Progress)
     trials.fit([(), *((name,) for name in suspects)])
     word = dict.fromkeys(prior, math.log(EXPECTED))
     rows = [
-        replace(trials.row((name,)), leads=name in leading, expected=word.get(name, 0.0))
+        replace(trials.row((name,)), leads=name in leading, told=catalogue()[name].told, expected=word.get(name, 0.0))
         for name in sorted(fit, key=lambda name: (-fit[name], name))
     ]
     return trials, [trials.none(), *rows]

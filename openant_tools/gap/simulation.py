@@ -494,6 +494,7 @@ class _Batch:
                 k = s * self._n + r
                 for name, values in out.items():
                     late = sum(robot.log_delay.get(group, 0.0) for group in LATE_WITH.get(name, (name,)))
+                    late -= 0.0 if name in ("pos", "vel") else self._plant.encoder_delay_s  # which rows come later by
                     when = at - late / h
                     found = states.at(name, k, np.clip(when, 0.0, steps), steps, robot)
                     if name == "pos" and late >= h and (before := when < 0).any():

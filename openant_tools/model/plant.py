@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import mujoco
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.model.attribute import Stated, set_stated
 from openant_tools.model.stripped import strip_colliding, strip_visual
+from openant_tools.numbers import number
 from openant_tools.robot.model_file import check_model_file
 
 __all__ = [
@@ -114,6 +115,23 @@ class Plant:
         model = copy.copy(self.model)
         model.opt.timestep = timestep
         return replace(self, model=model, step_s=self.timestep if self.step_s is None else self.step_s)
+
+    @cached_property
+    def encoder_delay_s(self) -> float:
+        """By how much later than it was a position is said, by sensors `pos.J` with a delay.
+
+        Raises:
+            BadInput: joints differ in that.
+        """
+        model = self.model
+        ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, f"pos.{joint}") for joint in self.joints]
+        delays = {float(model.sensor_delay[i]) if i >= 0 else 0.0 for i in ids}
+        if len(delays) > 1:
+            raise BadInput(
+                f"sensors pos.J say positions up to {number(max(delays), 's')} late, but not all of them the same",
+                where=self.path, remedy="give them one delay",
+            )  # fmt: skip
+        return delays.pop()
 
     @property
     def free_joint(self) -> int | None:

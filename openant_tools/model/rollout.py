@@ -11,6 +11,8 @@ Contract
   the row's `t`), held until the next; each step sees its mean over the step, so that results vary smoothly with delays
   and time stamps instead of by whole steps. (A servo that limits its setpoint's rate takes the command of the middle of
   each step: to a limiter a part of a change is as good as the whole.) A missing command leaves the one before in force.
+* **Late encoders.** Where sensors `pos.J` of the model have a delay, simulated joints are compared with what they say: rows hold
+  states of so much earlier, and commands act as much later in their time.
 * **Start of a segment.** Setpoint filters and slew limiters hold the first command; delay buffers hold the commands before it,
   of which there are none at the start of a run, so that there they hold the first; all other activations are zero (formats,
   section 5). A base whose pose was measured at most POSES_S before and after is between the two. Without a measured
@@ -393,7 +395,8 @@ def _segments(
     h, model = plant.timestep, plant.model
     torque_off = run.signal("torque", plant.joints, default=1.0) == 0
     flips = 1 + np.flatnonzero((torque_off[1:] != torque_off[:-1]).any(axis=1))
-    commands = Staircase.of(run.command_times, cmd)
+    # Rows say what was; to what they say commands come as much later.
+    commands = Staircase.of(run.command_times + plant.encoder_delay_s, cmd)
     rest = _at_rest(model)
     buffered = int(model.actuator_history[plant.actuator, 0].max(initial=0))
     bases: list[tuple[Array, Array] | None]

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import matplotlib.pyplot as plt
 import pytest
 from places import ROOT
 
@@ -34,6 +35,7 @@ def play(name: str, place: Path, cuts: dict[str, str], monkeypatch: pytest.Monke
     """What stands in a notebook's memory after all of its cells; `cuts` are made in them before."""
     monkeypatch.chdir(place)
     matplotlib.use("Agg")
+    plt.close("all")  # of the notebook before
     cells = json.loads((EXAMPLES / name).read_text(encoding="utf-8"))["cells"]
     text = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
     for cut in cuts:

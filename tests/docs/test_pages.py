@@ -233,6 +233,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory, thorough: bool) -> Path:
     run("config export --robot my-ant --out ant12.json", folder)
     if thorough:
         run("sysid record --protocol stand --seconds 8 --robot my-ant --out one.mcap", folder)
+        run("sysid record --protocol stand --seconds 8 --seed 1 --robot my-ant --out floor-2.mcap", folder)
         for name in ("sac-1", "sac-2"):
             run(f"train sac --robot my-ant --steps 100 --out my-ant/runs/{name}", folder)  # the first point of a curve
         run("thermal soak --robot my-ant --minutes 1 --out bare.mcap", folder)
@@ -315,13 +316,17 @@ def fit_for_here(words: list[str]) -> list[str]:
     options = options_of(command)
     simulated = bool({"--readings", "--static"} & set(words)) or ("--env" in options and "hardware" not in words)
     for option in ("--virtual", "--yes", "--until-eof"):
-        if option in options and option not in words and not (option == "--virtual" and simulated):
+        if option == "--virtual" and (simulated or option not in options or options[option].name != "virtual_source"):
+            continue  # nothing is asked of a robot
+        if option in options and option not in words:
             words = [*words, option]
     if "--virtual" in words and "--port" in words:  # which the virtual robot has of its own
         at = words.index("--port")
         words = [*words[:at], *words[at + 2 :]]
     if words[:2] == ["rec", "view"] and "--out" not in words:  # here is no screen to open a window on
         words = [*words, "--out", "view.rrd"]
+    if words[0] == "train" and "--steps" in options and "--steps" not in words:  # an hour
+        words = [*words, "--steps", "1300"]
     if words[:2] == ["comms", "watch"]:  # until Ctrl-C
         words = [*words, "--seconds", "2"]
     for option, most in AMOUNTS.items():

@@ -112,6 +112,16 @@ def test_lost_commands_that_are_seen_one_by_one_lead_whatever_else_fits() -> Non
     assert present([replace(beside, irregular=0.0)], 0.0, weights()) == {}
 
 
+def test_of_two_that_cannot_be_told_apart_the_motions_own_goes_into_the_model() -> None:
+    late = replace(DELAY, fit=12.0, support=1.31)
+    said = replace(late, causes=("sensor_delay",), support=1.35)
+    for told, selected in ((False, ("sensor_delay",)), (True, ("action_delay",))):
+        found = decide([NOTHING, late, replace(said, told=told)], CLEAR)
+        assert found.verdict == "ambiguous"
+        assert found.likeliest == "sensor_delay"
+        assert found.causes == selected
+
+
 def test_two_that_share_what_is_likely_are_ambiguous() -> None:
     alike = replace(LAG, causes=("action_delay",))
     found = decide([NOTHING, LAG, alike], CLEAR)

@@ -528,3 +528,42 @@ def test_a_run_that_measured_nothing_whole_is_refused(spoil: Callable[[Array], A
         BadInput, match=r"blind: no two rows have a position of every joint → check the pos\.\* columns"
     ):
         Rollouts(ant, [blind])
+
+
+@pytest.mark.parametrize("horizon", [None, 0.5])
+def test_positions_are_what_a_late_encoder_says(tmp_path: Path, horizon: float | None) -> None:
+    """As MuJoCo's own sensor does: commands are not late for that, and a start amid the run is where the joint was then."""
+    late = '<sensor><jointpos name="pos.joint" joint="joint" delay="0.03" nsample="40" interp="linear"/></sensor>'
+    model = plants.write(tmp_path / "late.xml", plants.pendulum(more=late))
+    on_time = plants.write(tmp_path / "on_time.xml", plants.pendulum())
+    t = 0.01 * np.arange(300)
+    command = plants.sweep(t, 1)[:, 0]
+    robot = plain.on_stand(model)
+    data = mujoco.MjData(robot)
+    data.joint("joint").qpos[0] = command[0]
+    said, were = np.empty(len(t)), np.empty(len(t))
+    for k, asked in enumerate(command):
+        mujoco.mj_step1(robot, data)  # which reads the sensors
+        said[k], were[k] = data.sensor("pos.joint").data[0], data.joint("joint").qpos[0]
+        data.ctrl[0] = asked
+        mujoco.mj_step2(robot, data)
+        mujoco.mj_step(robot, data, 9)
+    told = plants.run_of({"cmd.joint": command, "pos.joint": said}, t, ["joint"])
+    true = plants.run_of({"cmd.joint": command, "pos.joint": were}, t, ["joint"])
+    begun = t > 0.05  # buffers were filled with where it began
+
+    def off(path: Path, run: Run) -> float:
+        simulated = Rollouts(load_plant(path), [run], horizon)().pos[0, :, 0]
+        return float(np.sqrt(np.mean(np.square(simulated - run.column("pos.joint"))[begun])))
+
+    usual = off(on_time, true)
+    assert off(model, told) < usual + 1e-3 < 0.02 * off(on_time, told)
+
+
+def test_encoders_that_are_late_by_different_times_are_refused(tmp_path: Path) -> None:
+    text = nominal_model_path("standard").read_text()
+    assert (sensor := '<jointpos name="pos.hip_rr"') in text
+    model = plants.write(tmp_path / "one.xml", text.replace(sensor, f'{sensor} delay="0.03" nsample="40"'))
+    run = walking(load_plant(nominal_model_path("standard")), 0.5)
+    with pytest.raises(BadInput, match="not all of them the same"):
+        Rollouts(load_plant(model), [run])
