@@ -14,8 +14,7 @@ from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.step import Ask, Bench, Intent, Live, Procedure, Progress, Say, Subroutine
 from openant_tools.procedure.unfinished import Parts, unfinished
 from openant_tools.recording.tables import read_run
-from openant_tools.robot.kit import kit as kit_by_name
-from openant_tools.thermal.finding import thermal_finding, torque_warning
+from openant_tools.thermal.finding import thermal_finding, warning_of
 from openant_tools.thermal.fit import fit_and_judge
 from openant_tools.thermal.forecast import forecast, rest_advice
 from openant_tools.thermal.inputs import inputs_of
@@ -41,10 +40,7 @@ def _minutes(seconds: float) -> str:
 
 def thermal_soak(bench: Bench) -> Procedure:
     """Hold the home pose on the stand, keep every temperature, and say what heat will do to this robot."""
-    config = bench.folder.config()
-    kit = kit_by_name(config.kit)
-    knees = [(motor.joint, motor.servo) for motor in config.motors.values() if motor.kind == "knee"]
-    warning = torque_warning(knees, kit, supply_v=kit.supply_v, pwm_limit=config.bus.pwm_limit)
+    warning = warning_of(bench.folder.config())
     if warning:
         yield Say(warning, "warn")
     path = bench.folder.recordings / "soak.mcap"

@@ -609,9 +609,10 @@ def test_fit_forecast_and_compare_from_tables(tmp_path: Path, stress: Run) -> No
     assert not kept.ok
     code, out = command(
         "thermal", "forecast", tmp_path / "bare.parquet", "--at", 10, "--json", tmp_path / "told.json", "--derate",
-        "--robot", tmp_path / "ant", "--after", tmp_path / "fit.json",
+        "--robot", tmp_path / "ant", "--after", tmp_path / "fit.json", "--report", tmp_path / "ahead",
     )  # fmt: skip
     assert code == 1
+    assert (tmp_path / "ahead" / "report.html").is_file()
     assert "reaches 72 °C after" in out
     assert "advice: work" in out
     assert "walk with rests" in out
@@ -623,11 +624,18 @@ def test_fit_forecast_and_compare_from_tables(tmp_path: Path, stress: Run) -> No
     assert rules is not None
     assert 0 < rules.joints["knee_fl"].least < 1
     assert command("config", "check", "--robot", tmp_path / "ant")[0] == 0
-    code, out = command("thermal", "compare", tmp_path / "bare", tmp_path / "cool", "--json", tmp_path / "diff.json")
+    written_to = ("--json", tmp_path / "diff.json", "--report", tmp_path / "diff")
+    code, out = command("thermal", "compare", tmp_path / "bare", tmp_path / "cool", *written_to)
     assert code == 0
     assert "knee_fl" in out
     assert " *" in out
-    assert command("thermal", "compare", tmp_path / "bare", "--paper")[1].startswith("Paper: a Lite's knee")
+    assert (tmp_path / "diff" / "report.html").is_file()
+    written_to = ("--json", tmp_path / "paper.json", "--report", tmp_path / "paper")
+    code, out = command("thermal", "compare", tmp_path / "bare", "--paper", *written_to)
+    assert code == 0
+    assert out.startswith("Paper: a Lite's knee")
+    assert json.loads((tmp_path / "paper.json").read_text())["paper"] == out.splitlines()[0]
+    assert out.splitlines()[0] in (tmp_path / "paper" / "report.md").read_text()
 
 
 def test_a_trained_policy_is_a_load(tmp_path: Path) -> None:
