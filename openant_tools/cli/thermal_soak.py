@@ -11,18 +11,19 @@ from typing import TYPE_CHECKING
 
 import click
 
+from openant_tools.cli.face import CommandFace
 from openant_tools.cli.hardware import Moving, anyway_option, engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import Number, json_option, robot_option
 from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
 from openant_tools.numbers import exact, number, percent
+from openant_tools.procedure.step import Answer, Event, Live, Progress, drive
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
 
     from openant_tools.comms.messages import EngineConfig
     from openant_tools.robot.folder import RobotFolder
-    from openant_tools.thermal.soak import HeatSoaked, Sample, SoakPlan
+    from openant_tools.thermal.soak import SoakPlan
 
 __all__ = ["soak"]
 
@@ -124,12 +125,11 @@ def soak(
 
     Exit code 1: a servo came so near its limit that the load ended early.
     """
-    from rich.console import Console
-
     from openant_tools.errors import BadInput
     from openant_tools.recording.writer import recording_path
     from openant_tools.robot.joints import JOINT_NAMES
     from openant_tools.thermal.soak import SoakPlan, pose_angles, resume_plan
+    from openant_tools.thermal.soak import soak as run_soak
 
     out = recording_path(out)
     if resume:
@@ -155,7 +155,8 @@ def soak(
         )
         for pose in plan.poses:
             pose_angles(pose, JOINT_NAMES)
-    console = Console(stderr=True, highlight=False)
+    face = _Curves(yes=yes)
+    console = face.console
     folder = robot_of(robot, needed=virtual_source is None)
     if not resume and commands is not None and commands.is_dir():
         from openant_tools.cli.policy_commands import policy_commands
@@ -170,7 +171,16 @@ def soak(
             f"min of cooling. {'The knees press' if plan.load == 'stall' else 'All joints move'} on {config.port}."
         )
         may_move(yes)
-        made = _run(console, config, plan, out, folder, resume)
+        toml = None if folder is None else folder.config_file.read_text()
+        try:
+            with face.table:
+                made = drive(run_soak(config, plan, out, robot_toml=toml, resume=resume), face)
+        except BaseException:
+            if out.exists():
+                console.print(
+                    f"kept what was recorded: go on with `openant thermal soak --resume --out {out}`", markup=False
+                )
+            raise
     for joint, peak in made.peak_c.items():
         click.echo(
             f"{joint:9} {number(peak, '°C', decimals=0):>6} at most"
@@ -204,102 +214,61 @@ def _connected(
     return soak_config(config, rate_hz, plan.margin_k)
 
 
-def _run(
-    console: Console, config: EngineConfig, plan: SoakPlan, out: Path, folder: RobotFolder | None, resume: bool
-) -> HeatSoaked:
-    """Drive the soak and draw it; Ctrl-C says how to go on."""
-    from rich.live import Live
+class _Curves(CommandFace):
+    """As any procedure is shown, and what lives as curves: newest values, and each servo's temperature so far as a strip."""
 
-    from openant_tools.thermal.soak import soak as soaking
+    def __init__(self, *, yes: bool) -> None:
+        from rich.live import Live as Table
 
-    steps = soaking(
-        config, plan, out, robot_toml=None if folder is None else folder.config_file.read_text(), resume=resume
-    )
-    curves = _Curves(console)
-    live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
-    drawn = said = -math.inf
-    try:
-        with live or contextlib.nullcontext():
-            while True:
-                sample = next(steps)
-                curves.take(sample)
-                now = time.monotonic()
-                if sample.words:
-                    console.print(sample.words, markup=False)
-                if live is not None and now - drawn > DRAW_S:
-                    drawn = now
-                    live.update(curves.table(sample), refresh=True)
-                elif live is None and now - said > LINE_S:
-                    said = now
-                    console.print(curves.line(sample), markup=False)
-    except StopIteration as end:
-        made: HeatSoaked = end.value
-        return made
-    except BaseException:
-        steps.close()
-        if out.exists():
-            console.print(
-                f"kept what was recorded: go on with `openant thermal soak --resume --out {out}`", markup=False
-            )
-        raise
+        super().__init__(yes=yes)
+        self._bars = _BARS if (self.console.encoding or "").lower().startswith("utf") else _PLAIN_BARS
+        self._past: dict[str, list[float]] = {}
+        self._doing, self._at = "", -math.inf
+        self.table = Table(console=self.console, auto_refresh=False, transient=True)
 
+    def answer(self, event: Event) -> Answer:
+        if isinstance(event, Progress):
+            self._doing = f"{event.words}, {percent(event.share or 0.0)}"
+            if self.console.is_terminal:
+                return None
+        return super().answer(event)
 
-class _Curves:
-    """What the live table shows: newest values, and each servo's temperature so far as a strip."""
+    def _show(self, live: Live) -> bool:
+        for joint, value in live.values.items():
+            self._past.setdefault(joint, []).append(value)
+        terminal, now = self.console.is_terminal, time.monotonic()
+        if now - self._at > (DRAW_S if terminal else LINE_S):
+            self._at = now
+            if terminal:
+                self.table.update(self._drawn(live), refresh=True)
+            elif live.values:
+                warmest = max(live.values, key=lambda joint: live.values[joint] - live.high[joint])
+                self._line(f"{self._doing}: {warmest} {self._of(live, warmest)} °C")
+        return super()._show(replace(live, low={}))
 
-    def __init__(self, console: Console) -> None:
-        self._bars = _BARS if (console.encoding or "").lower().startswith("utf") else _PLAIN_BARS
-        self._past: list[list[float]] = []
-
-    def take(self, sample: Sample) -> None:
-        self._past.append(sample.temperature_c.tolist())
-
-    def table(self, sample: Sample) -> Table:
+    def _drawn(self, live: Live) -> Table:
         from rich.table import Table
 
-        minutes = sample.seconds / 60
         table = Table(
-            title=f"{sample.phase}, {number(minutes, 'min', decimals=1)}, {percent(sample.share)}",
-            title_justify="left",
-            box=None,
+            "servo", "°C", "", "so far", title=self._doing, caption=live.words, title_justify="left", box=None
         )
-        for name, justify in (
-            ("servo", "left"),
-            ("°C", "right"),
-            ("limit", "right"),
-            ("K/min", "right"),
-            ("effort", "right"),
-        ):
-            table.add_column(name, justify=justify)  # type: ignore[arg-type]
-        table.add_column("V", justify="right")
-        table.add_column("so far")
-        for k, joint in enumerate(sample.joints):
-            now, limit = sample.temperature_c[k], sample.limit_c[k]
-            colour = "red" if now >= limit - 5 else "yellow" if now >= limit - 15 else "default"
-            effort = sample.current_a[k] if math.isfinite(sample.current_a[k]) else sample.load[k]
-            unit = " A" if math.isfinite(sample.current_a[k]) else ""
-            table.add_row(
-                joint, f"[{colour}]{number(now, decimals=0)}[/{colour}]", number(limit, decimals=0),
-                "–" if math.isnan(sample.rate_k_min[k]) else number(sample.rate_k_min[k], sign=True, decimals=1),
-                "–" if math.isnan(effort) else f"{number(effort, sign=True, decimals=2)}{unit}", number(sample.volts[k], decimals=1), self._strip(k, limit),
-            )  # fmt: skip
+        for joint, value in live.values.items():
+            left = live.high[joint] - value
+            colour = "red" if left <= 5 else "yellow" if left <= 15 else "default"
+            now = f"[{colour}]{self._of(live, joint)}[/{colour}]"
+            table.add_row(joint, now, live.marks.get(joint, ""), self._strip(joint, live.high[joint]))
         return table
 
-    def line(self, sample: Sample) -> str:
-        warmest = max(range(len(sample.joints)), key=lambda k: sample.temperature_c[k] - sample.limit_c[k])
-        return (
-            f"{sample.phase} {number(sample.seconds / 60, 'min', decimals=1)} ({percent(sample.share)}): {sample.joints[warmest]} "
-            f"{number(sample.temperature_c[warmest], '°C', decimals=0)} of {number(sample.limit_c[warmest], decimals=0)}"
-        )
+    @staticmethod
+    def _of(live: Live, joint: str) -> str:
+        """`43 of 72`."""
+        return f"{number(live.values[joint], decimals=0)} of {number(live.high[joint], decimals=0)}"
 
-    def _strip(self, k: int, limit: float) -> str:
+    def _strip(self, joint: str, limit: float) -> str:
         """From the coldest reading to the limit."""
-        every = max(1, len(self._past) // CURVE)
-        values = [row[k] for row in self._past[::every] if math.isfinite(row[k])]
-        if not values:
-            return ""
-        low = min(values)
-        steps = len(self._bars) - 1
+        past = self._past[joint]
+        values = past[:: max(1, len(past) // CURVE)]
+        low, steps = min(values), len(self._bars) - 1
         return "".join(self._bars[min(steps, max(0, round((v - low) / max(limit - low, 1.0) * steps)))] for v in values)
 
 
