@@ -3,36 +3,23 @@
 from __future__ import annotations
 
 import contextlib
-import math
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from openant_tools.cli.face import CommandFace
 from openant_tools.cli.hardware import Moving, anyway_option, engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import Number, json_option, robot_option
 from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
 from openant_tools.numbers import exact, number, percent
-from openant_tools.procedure.step import Answer, Event, Live, Progress, drive
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from openant_tools.comms.messages import EngineConfig
     from openant_tools.robot.folder import RobotFolder
     from openant_tools.thermal.soak import SoakPlan
 
 __all__ = ["soak"]
-
-_BARS = "▁▂▃▄▅▆▇█"
-_PLAIN_BARS = "_.,-=+*#"
-#: points of a live curve
-CURVE = 32
-#: s between two drawings of the live table, and between two lines where no terminal is attached
-DRAW_S, LINE_S = 0.25, 20.0
 
 
 @click.command(cls=Moving)
@@ -125,7 +112,9 @@ def soak(
 
     Exit code 1: a servo came so near its limit that the load ended early.
     """
+    from openant_tools.cli.thermal_curves import Curves
     from openant_tools.errors import BadInput
+    from openant_tools.procedure.step import drive
     from openant_tools.recording.writer import recording_path
     from openant_tools.robot.joints import JOINT_NAMES
     from openant_tools.thermal.soak import SoakPlan, pose_angles, resume_plan
@@ -155,7 +144,7 @@ def soak(
         )
         for pose in plan.poses:
             pose_angles(pose, JOINT_NAMES)
-    face = _Curves(yes=yes)
+    face = Curves(yes=yes)
     console = face.console
     folder = robot_of(robot, needed=virtual_source is None)
     if not resume and commands is not None and commands.is_dir():
@@ -212,64 +201,6 @@ def _connected(
         source = stack.enter_context(placed(source, plan.setup, doze=True))
     config = stack.enter_context(engine_config(folder, port, source, anyway=anyway))
     return soak_config(config, rate_hz, plan.margin_k)
-
-
-class _Curves(CommandFace):
-    """As any procedure is shown, and what lives as curves: newest values, and each servo's temperature so far as a strip."""
-
-    def __init__(self, *, yes: bool) -> None:
-        from rich.live import Live as Table
-
-        super().__init__(yes=yes)
-        self._bars = _BARS if (self.console.encoding or "").lower().startswith("utf") else _PLAIN_BARS
-        self._past: dict[str, list[float]] = {}
-        self._doing, self._at = "", -math.inf
-        self.table = Table(console=self.console, auto_refresh=False, transient=True)
-
-    def answer(self, event: Event) -> Answer:
-        if isinstance(event, Progress):
-            self._doing = f"{event.words}, {percent(event.share or 0.0)}"
-            if self.console.is_terminal:
-                return None
-        return super().answer(event)
-
-    def _show(self, live: Live) -> bool:
-        for joint, value in live.values.items():
-            self._past.setdefault(joint, []).append(value)
-        terminal, now = self.console.is_terminal, time.monotonic()
-        if now - self._at > (DRAW_S if terminal else LINE_S):
-            self._at = now
-            if terminal:
-                self.table.update(self._drawn(live), refresh=True)
-            elif live.values:
-                warmest = max(live.values, key=lambda joint: live.values[joint] - live.high[joint])
-                self._line(f"{self._doing}: {warmest} {self._of(live, warmest)} °C")
-        return super()._show(replace(live, low={}))
-
-    def _drawn(self, live: Live) -> Table:
-        from rich.table import Table
-
-        table = Table(
-            "servo", "°C", "", "so far", title=self._doing, caption=live.words, title_justify="left", box=None
-        )
-        for joint, value in live.values.items():
-            left = live.high[joint] - value
-            colour = "red" if left <= 5 else "yellow" if left <= 15 else "default"
-            now = f"[{colour}]{self._of(live, joint)}[/{colour}]"
-            table.add_row(joint, now, live.marks.get(joint, ""), self._strip(joint, live.high[joint]))
-        return table
-
-    @staticmethod
-    def _of(live: Live, joint: str) -> str:
-        """`43 of 72`."""
-        return f"{number(live.values[joint], decimals=0)} of {number(live.high[joint], decimals=0)}"
-
-    def _strip(self, joint: str, limit: float) -> str:
-        """From the coldest reading to the limit."""
-        past = self._past[joint]
-        values = past[:: max(1, len(past) // CURVE)]
-        low, steps = min(values), len(self._bars) - 1
-        return "".join(self._bars[min(steps, max(0, round((v - low) / max(limit - low, 1.0) * steps)))] for v in values)
 
 
 def _joints(names: tuple[str, ...]) -> tuple[str, ...]:

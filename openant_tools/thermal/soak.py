@@ -511,18 +511,13 @@ def _seen(
 
 def _marks(rate_k_min: float, current_a: float, load: float, volts: float) -> str:
     """What stands beside a temperature: how fast it rises, how hard the servo works, its supply."""
-    effort = (
-        number(load, sign=True, decimals=2) if math.isnan(current_a) else number(current_a, "A", sign=True, decimals=2)
+    effort, unit = (load, "") if math.isnan(current_a) else (current_a, " A")
+    said = (
+        (rate_k_min, number(rate_k_min, "K/min", sign=True, decimals=1)),
+        (effort, f"{number(effort, sign=True, decimals=2)}{unit}"),
+        (volts, number(volts, "V", decimals=1)),
     )
-    return ", ".join(
-        words
-        for value, words in (
-            (rate_k_min, number(rate_k_min, "K/min", sign=True, decimals=1)),
-            (load if math.isnan(current_a) else current_a, effort),
-            (volts, number(volts, "V", decimals=1)),
-        )
-        if math.isfinite(value)
-    )
+    return ", ".join(words for value, words in said if math.isfinite(value))
 
 
 def _lie_down(engine: EngineProcess, config: EngineConfig) -> None:
