@@ -12,7 +12,7 @@ With S_i the average reward of policy i in a simulation and R_i on the robot:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from openant_agents.evaluate import LIKELIEST, SAMPLED, evaluate
-from openant_agents.exploits import Flag, TwitchCounter, flag
+from openant_agents.exploits import DISTURBANCES, Flag, TwitchCounter, flag
+from openant_agents.places import Place
 from openant_agents.policies import load_policy
 from openant_agents.runs import read_facts
 from openant_tools.errors import BadInput
@@ -31,12 +32,14 @@ from openant_tools.files import json_text, read_json, write_text
 from openant_tools.procedure.intervals import Interval
 
 __all__ = [
-    "Agreement", "PlaceResult", "Ranking", "agreement", "check_names", "find_policies", "kendall", "play", "rank", "rank_violation",
+    "Agreement", "PlaceResult", "Ranking", "agreement", "check_names", "find_policies", "kendall", "play", "play_all", "play_disturbed", "rank", "rank_violation",
     "read_measured", "regret", "spearman", "write_measured",
 ]  # fmt: skip
 
 SCHEMA = "openant.policies/1"
 RESAMPLES = 2_000
+#: times fewer starts where a simulation is disturbed: what falls apart there is seen in a few
+FEWER = 5
 #: what the robot is called among the places of a ranking's file
 ROBOT = "real"
 
@@ -273,7 +276,7 @@ def play(
     seconds: float,
     starts: int,
     likeliest: bool = False,
-    report: Callable[[float], None] | None = None,
+    progress: Callable[[float, str], None] = lambda share, words: None,
 ) -> PlaceResult:
     """Play a policy from some starts, with other headings each.
 
@@ -283,7 +286,6 @@ def play(
         seconds: s of robot time from each start.
         starts: how many.
         likeliest: whether its likeliest action is played beside it.
-        report: called with the share done.
 
     Raises:
         BadInput: no such policy, or one that does not fit the place.
@@ -295,11 +297,10 @@ def play(
         done, reversals_hz = [], math.nan
         for number, way in enumerate(ways):
 
-            def tell(played: float, average: float, number: int = number) -> None:
-                if report is not None:
-                    report((number + played / (starts * seconds)) / len(ways))
+            def tell(share: float, words: str, number: int = number) -> None:
+                progress((number + share) / len(ways), words)
 
-            done.append(evaluate(env, policy, way=way, seconds=seconds, starts=starts, report=tell))
+            done.append(evaluate(env, policy, way=way, seconds=seconds, starts=starts, progress=tell))
             if way == SAMPLED:
                 reversals_hz = env.reversals_hz
         sampled = done[0]
@@ -308,6 +309,49 @@ def play(
         )
     finally:
         env.close()
+
+
+def play_all(
+    runs: Mapping[str, Path],
+    place: Place,
+    *,
+    seconds: float,
+    starts: int | None = None,
+    likeliest: bool = False,
+    wrapper: Callable[[Any], Any] | None = None,
+    progress: Callable[[float, str], None] = lambda share, words: None,
+) -> Iterator[tuple[str, PlaceResult]]:
+    """Play each policy in one place: its name and what it achieved, as soon as that is known.
+
+    Args:
+        starts: None for as many as the place asks for. wrapper: disturbs the place. The rest as of `play`.
+    """
+    for number, (name, run) in enumerate(runs.items()):
+
+        def tell(share: float, words: str, number: int = number, name: str = name) -> None:
+            at = f"{place.name}: {name} ({number + 1} of {len(runs)}), {words}"
+            progress((number + share) / len(runs), at)
+
+        yield name, play(
+            run, lambda facts: place.make(facts, wrapper), seconds=seconds, starts=starts or place.starts,
+            likeliest=likeliest, progress=tell,
+        )  # fmt: skip
+
+
+def play_disturbed(
+    runs: Mapping[str, Path],
+    place: Place,
+    *,
+    seconds: float,
+    starts: int | None = None,
+    progress: Callable[[float, str], None] = lambda share, words: None,
+) -> dict[str, dict[str, PlaceResult]]:
+    """What each policy achieves where a simulation is disturbed, by disturbance, from a fifth of the starts; as `play_all`."""
+    few = max(1, (starts or place.starts) // FEWER)
+    return {
+        words: dict(play_all(runs, place, seconds=seconds, starts=few, wrapper=wrapper, progress=progress))
+        for words, wrapper in DISTURBANCES.items()
+    }
 
 
 # ------------------------------------------------------------------------------------------------------------- files

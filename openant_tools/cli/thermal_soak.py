@@ -148,9 +148,7 @@ def soak(
     console = face.console
     folder = robot_of(robot, needed=virtual_source is None)
     if not resume and commands is not None and commands.is_dir():
-        from openant_tools.cli.policy_commands import policy_commands
-
-        plan = replace(plan, commands=str(policy_commands(commands, out, folder)))
+        plan = replace(plan, commands=str(_walked(commands, out, folder)))
     with contextlib.ExitStack() as stack:
         config = _connected(
             stack, plan, virtual_source, port, folder, rate_hz or (50.0 if plan.load == "play" else 5.0), anyway
@@ -183,6 +181,23 @@ def soak(
 
         write_text(json_file, json_text({**vars(made), "path": str(made.path)}))
     return 0 if made.why == "time" else 1
+
+
+def _walked(run: Path, out: Path, folder: RobotFolder | None) -> Path:
+    """What the policy of a training run commands in the simulation, as a table beside `out`."""
+    from openant_tools.cli.learning import need_agents
+    from openant_tools.cli.walking import environment
+
+    need_agents()
+    from openant_agents.places import SIMULATED_ID, simulated_options
+    from openant_agents.rollout import write_commands
+    from openant_agents.runs import read_facts
+
+    options = simulated_options(read_facts(run)["env"]["options"], None if folder is None else folder.path)
+    table = out.with_name(f"{out.stem}-policy.parquet")
+    with environment(SIMULATED_ID, options, run / "recordings") as env:
+        write_commands(env, run, table)
+    return table
 
 
 def _connected(
