@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -14,9 +13,6 @@ from openant_tools.cli.options import MINUTES, json_option, rate_option, robot_o
 from openant_tools.cli.progress import BarFace, progress_bar
 from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option
 from openant_tools.numbers import number, percent
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["soak"]
 
@@ -162,8 +158,6 @@ def _transactions(source: str, out: Path, seconds: float, rate_hz: float, still:
         )
     scenario = Scenario() if source == VIRTUAL_DEFAULT else load_scenario(Path(source))
     with progress_bar("soaking") as tell:
-        run = swinging_soak(
-            scenario, seconds, rate_hz, out.stem, still=still, progress=lambda share: tell(share, "soaking")
-        )
+        run = swinging_soak(scenario, seconds, rate_hz, out.stem, still=still, progress=tell)
     write_table(run, out)
     click.echo(f"{out}  {number(run.duration_s, 's', decimals=0)}, {len(run.t)} rows")
