@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -70,7 +70,7 @@ class Place:
         """How often a policy starts anew there, where nobody says."""
         return STARTS_ON_A_ROBOT if self.is_robot else STARTS_IN_SIMULATION
 
-    def make(self, facts: Mapping[str, Any], wrapper: Callable[[Any], Any] | None = None) -> Any:
+    def make(self, facts: Mapping[str, Any]) -> Any:
         """The environment, with the task, step and range of actions that a policy was trained with (`facts["options"]`)."""
         import gymnasium
 
@@ -78,5 +78,4 @@ class Place:
 
         kept = {key: facts["options"][key] for key in ("task", "dt", "action_range") if key in facts["options"]}
         name = HARDWARE_ID if self.is_robot else SIMULATED_ID
-        env = gymnasium.make(name, max_episode_steps=-1, **kept, **self.options)
-        return env if wrapper is None else wrapper(env)
+        return gymnasium.make(name, max_episode_steps=-1, **kept, **self.options)

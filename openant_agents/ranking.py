@@ -17,7 +17,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
@@ -30,9 +29,11 @@ from openant_agents.runs import read_facts
 from openant_tools.errors import BadInput
 from openant_tools.files import json_text, read_json, write_text
 from openant_tools.procedure.intervals import Interval
+from openant_tools.procedure.relay import part_of
 
 __all__ = [
-    "Agreement", "PlaceResult", "Ranking", "agreement", "check_names", "find_policies", "kendall", "play", "play_all", "play_disturbed", "rank", "rank_violation",
+    "Agreement", "PlaceResult", "Ranking", "agreement", "check_names", "find_policies", "kendall", "play", "play_disturbed", "rank",
+    "rank_violation",
     "read_measured", "regret", "spearman", "write_measured",
 ]  # fmt: skip
 
@@ -270,86 +271,46 @@ def find_policies(folder: Path) -> dict[str, Path]:
 
 
 def play(
-    run: Path,
-    make_env: Callable[[Mapping[str, Any]], gymnasium.Env[Any, Any]],
-    *,
-    seconds: float,
-    starts: int,
-    likeliest: bool = False,
+    runs: Mapping[str, Path], place: Place, *, seconds: float, starts: int | None = None, likeliest: bool = False,
+    wrapper: Callable[[Any], Any] = lambda env: env,
     progress: Callable[[float, str], None] = lambda share, words: None,
-) -> PlaceResult:
-    """Play a policy from some starts, with other headings each.
+) -> Iterator[tuple[str, PlaceResult]]:  # fmt: skip
+    """Play each policy in one place: its name and what it achieved, as soon as that is known.
 
     Args:
-        run: the policy's.
-        make_env: makes the place from how the policy's own environment was made (its `run.json`).
-        seconds: s of robot time from each start.
-        starts: how many.
-        likeliest: whether its likeliest action is played beside it.
+        runs: name → training run. seconds: s of robot time from each start.
+        starts: how many, with other headings each; None for as many as the place asks for.
+        likeliest: whether the likeliest action is played beside it. wrapper: disturbs the place.
 
     Raises:
         BadInput: no such policy, or one that does not fit the place.
     """
-    ways = (SAMPLED, LIKELIEST) if likeliest else (SAMPLED,)
-    env = TwitchCounter(make_env(read_facts(run)["env"]))
-    try:
-        policy = load_policy(run, env)
-        done, reversals_hz = [], math.nan
-        for number, way in enumerate(ways):
-
-            def tell(share: float, words: str, number: int = number) -> None:
-                progress((number + share) / len(ways), words)
-
-            done.append(evaluate(env, policy, way=way, seconds=seconds, starts=starts, progress=tell))
-            if way == SAMPLED:
-                reversals_hz = env.reversals_hz
-        sampled = done[0]
-        return PlaceResult.of(
-            sampled.rewards.tolist(), reversals_hz, sampled.helped.total(), done[1].as_dict() if likeliest else None
-        )
-    finally:
-        env.close()
-
-
-def play_all(
-    runs: Mapping[str, Path],
-    place: Place,
-    *,
-    seconds: float,
-    starts: int | None = None,
-    likeliest: bool = False,
-    wrapper: Callable[[Any], Any] | None = None,
-    progress: Callable[[float, str], None] = lambda share, words: None,
-) -> Iterator[tuple[str, PlaceResult]]:
-    """Play each policy in one place: its name and what it achieved, as soon as that is known.
-
-    Args:
-        starts: None for as many as the place asks for. wrapper: disturbs the place. The rest as of `play`.
-    """
+    ways, starts = (SAMPLED, LIKELIEST) if likeliest else (SAMPLED,), starts or place.starts
     for number, (name, run) in enumerate(runs.items()):
-
-        def tell(share: float, words: str, number: int = number, name: str = name) -> None:
-            at = f"{place.name}: {name} ({number + 1} of {len(runs)}), {words}"
-            progress((number + share) / len(runs), at)
-
-        yield name, play(
-            run, lambda facts: place.make(facts, wrapper), seconds=seconds, starts=starts or place.starts,
-            likeliest=likeliest, progress=tell,
-        )  # fmt: skip
+        env = TwitchCounter(wrapper(place.make(read_facts(run)["env"])))
+        try:
+            policy = load_policy(run, env)
+            done, reversals_hz = [], math.nan
+            for way in ways:
+                words = f"{place.name}: {name} ({number + 1} of {len(runs)}), "
+                tell = part_of(progress, number * len(ways) + len(done), len(runs) * len(ways), words)
+                done.append(evaluate(env, policy, way=way, seconds=seconds, starts=starts, progress=tell))
+                if way == SAMPLED:
+                    reversals_hz = env.reversals_hz
+        finally:
+            env.close()
+        rewards, helped = done[0].rewards.tolist(), done[0].helped.total()
+        yield name, PlaceResult.of(rewards, reversals_hz, helped, done[1].as_dict() if likeliest else None)
 
 
 def play_disturbed(
-    runs: Mapping[str, Path],
-    place: Place,
-    *,
-    seconds: float,
-    starts: int | None = None,
+    runs: Mapping[str, Path], place: Place, *, seconds: float, starts: int | None,
     progress: Callable[[float, str], None] = lambda share, words: None,
-) -> dict[str, dict[str, PlaceResult]]:
-    """What each policy achieves where a simulation is disturbed, by disturbance, from a fifth of the starts; as `play_all`."""
+) -> dict[str, dict[str, PlaceResult]]:  # fmt: skip
+    """What each policy achieves where a simulation is disturbed, by disturbance, from a fifth of the starts; as `play`."""
     few = max(1, (starts or place.starts) // FEWER)
     return {
-        words: dict(play_all(runs, place, seconds=seconds, starts=few, wrapper=wrapper, progress=progress))
+        words: dict(play(runs, place, seconds=seconds, starts=few, wrapper=wrapper, progress=progress))
         for words, wrapper in DISTURBANCES.items()
     }
 

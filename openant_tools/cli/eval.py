@@ -25,6 +25,7 @@ from openant_tools.cli.walking import (
 )
 from openant_tools.errors import BadInput
 from openant_tools.numbers import number
+from openant_tools.procedure.relay import part_of
 
 if TYPE_CHECKING:
     from openant_agents.evaluate import Plays
@@ -147,10 +148,7 @@ def eval_(
         found = []
         with progress_bar("walking") as bar:
             for played, way in enumerate(ways):
-
-                def tell(share: float, words: str, played: int = played) -> None:
-                    bar((played + share) / len(ways), words)
-
+                tell = part_of(bar, played, len(ways))
                 found.append(evaluate(env, policy, way=way, seconds=seconds, starts=starts, seed=seed, progress=tell))
         sampled = found[0]
         if strip is not None or video is not None:

@@ -138,8 +138,8 @@ def rank(
         chooser = flag_by or next(iter(places))
         worse: dict[str, dict[str, PlaceResult]] = {}
         if not places[chooser].endswith(".json"):
-            with progress_bar(places[chooser]) as tell:
-                where = Place.named(places[chooser])
+            where = _place(places[chooser], False)
+            with progress_bar(where.name) as tell:
                 worse = play_disturbed(runs, where, seconds=seconds, starts=starts, progress=tell)
         found = found.flagged(chooser, worse)
     _print(found)
@@ -191,21 +191,24 @@ def _simulations(given: tuple[str, ...]) -> dict[str, str]:
 def _play(
     runs: Mapping[str, Path], place: str, seconds: float, starts: int | None, yes: bool, *, likeliest: bool = False
 ) -> Iterator[tuple[str, PlaceResult]]:
-    """(name, what it achieved) of each policy, with progress; from a file where the place is one.
-
-    Raises:
-        BadInput: no such place, or a robot that may not move.
-    """
-    from openant_agents.ranking import play_all, read_measured
+    """(name, what it achieved) of each policy, with progress; from a file where the place is one."""
+    from openant_agents.ranking import play as played
+    from openant_agents.ranking import read_measured
 
     if place.endswith(".json"):
         yield from ((name, one) for name, one in read_measured(Path(place)).items() if name in runs)
         return
-    where = Place.named(place)
-    if where.is_hardware:
-        may_walk(where.options, yes)
+    where = _place(place, yes)
     with progress_bar(place) as tell:
-        yield from play_all(runs, where, seconds=seconds, starts=starts, likeliest=likeliest, progress=tell)
+        yield from played(runs, where, seconds=seconds, starts=starts, likeliest=likeliest, progress=tell)
+
+
+def _place(name: str, yes: bool) -> Place:
+    """Where to play; a robot only where it may walk."""
+    place = Place.named(name)
+    if place.is_hardware:
+        may_walk(place.options, yes)
+    return place
 
 
 def _achieved(measured: PlaceResult) -> str:

@@ -136,7 +136,7 @@ def forecast(
     from openant_tools.errors import BadInput
     from openant_tools.thermal.finding import keep_derating, warning_of
     from openant_tools.thermal.fit import Known
-    from openant_tools.thermal.outlook import outlook
+    from openant_tools.thermal.forecast import outlook
 
     inputs = _read(run)
     ahead = outlook(
