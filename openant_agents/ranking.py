@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-from openant_agents.evaluate import LIKELIEST, SAMPLED, evaluate
+from openant_agents.evaluate import LIKELIEST, SAMPLED, Plays, evaluate
 from openant_agents.exploits import DISTURBANCES, Flag, TwitchCounter, flag
 from openant_agents.places import Place
 from openant_agents.policies import load_policy
@@ -290,7 +290,7 @@ def play(
         env = TwitchCounter(wrapper(place.make(read_facts(run)["env"])))
         try:
             policy = load_policy(run, env)
-            done, reversals_hz = [], math.nan
+            done, reversals_hz = list[Plays](), math.nan
             for way in ways:
                 words = f"{place.name}: {name} ({number + 1} of {len(runs)}), "
                 tell = part_of(progress, number * len(ways) + len(done), len(runs) * len(ways), words)

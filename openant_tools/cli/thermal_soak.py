@@ -15,7 +15,6 @@ from openant_tools.cli.virtual_for_command import placeable, placed, virtual_opt
 from openant_tools.numbers import exact, number, percent
 
 if TYPE_CHECKING:
-    from openant_tools.comms.messages import EngineConfig
     from openant_tools.robot.folder import RobotFolder
     from openant_tools.thermal.soak import SoakPlan
 
@@ -117,7 +116,7 @@ def soak(
     from openant_tools.procedure.step import drive
     from openant_tools.recording.writer import recording_path
     from openant_tools.robot.joints import JOINT_NAMES
-    from openant_tools.thermal.soak import SoakPlan, pose_angles, resume_plan
+    from openant_tools.thermal.soak import SoakPlan, pose_angles, resume_plan, soak_config
     from openant_tools.thermal.soak import soak as run_soak
 
     out = recording_path(out)
@@ -150,9 +149,10 @@ def soak(
     if not resume and commands is not None and commands.is_dir():
         plan = replace(plan, commands=str(_walked(commands, out, folder)))
     with contextlib.ExitStack() as stack:
-        config = _connected(
-            stack, plan, virtual_source, port, folder, rate_hz or (50.0 if plan.load == "play" else 5.0), anyway
-        )
+        if virtual_source is not None and placeable(virtual_source):
+            virtual_source = stack.enter_context(placed(virtual_source, plan.setup, doze=True))
+        config = stack.enter_context(engine_config(folder, port, virtual_source, anyway=anyway))
+        config = soak_config(config, rate_hz or (50.0 if plan.load == "play" else 5.0), plan.margin_k)
         console.print(
             f"{'going on with ' if resume else ''}{_words(plan)}, {exact(plan.seconds / 60, 'min')}, then {exact(plan.cool_down_s / 60)} "
             f"min of cooling. {'The knees press' if plan.load == 'stall' else 'All joints move'} on {config.port}."
@@ -198,24 +198,6 @@ def _walked(run: Path, out: Path, folder: RobotFolder | None) -> Path:
     with environment(SIMULATED_ID, options, run / "recordings") as env:
         write_commands(env, run, table)
     return table
-
-
-def _connected(
-    stack: contextlib.ExitStack,
-    plan: SoakPlan,
-    virtual_source: str | None,
-    port: str | None,
-    folder: RobotFolder | None,
-    rate_hz: float,
-    anyway: bool,
-) -> EngineConfig:
-    from openant_tools.thermal.soak import soak_config
-
-    source = virtual_source
-    if source is not None and placeable(source):
-        source = stack.enter_context(placed(source, plan.setup, doze=True))
-    config = stack.enter_context(engine_config(folder, port, source, anyway=anyway))
-    return soak_config(config, rate_hz, plan.margin_k)
 
 
 def _joints(names: tuple[str, ...]) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -37,7 +37,6 @@ __all__ = [
     "POSES",
     "HeatSoaked",
     "Load",
-    "Phase",
     "SoakPlan",
     "pose_angles",
     "resume_plan",
@@ -495,7 +494,7 @@ def _doing(plan: SoakPlan, pose: int) -> str:
 
 
 def _seen(
-    log: _Log, limits: Array, seconds: float, share: float, doing: str, notices: Sequence[str]
+    log: _Log, limits: Array, seconds: float, share: float, doing: str, notices: Iterable[str]
 ) -> Subroutine[bool]:
     """Show how far it is and how warm the servos are, `seconds` after the load began; whether that was enough."""
     for words in notices:
