@@ -26,7 +26,7 @@ from openant_tools.comms.restart import MotionStopped
 from openant_tools.comms.setup import config_of_unknown_robot
 from openant_tools.errors import BadInput, HardwareFault, OpenAntError
 from openant_tools.procedure.finding import Finding, latest
-from openant_tools.procedure.step import Ask, Event, Progress
+from openant_tools.procedure.step import Answer, Ask, Event, Live, Progress, drive
 from openant_tools.procedure.unfinished import unfinished
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.resume import continuation
@@ -435,6 +435,24 @@ def test_a_soak_ends_below_the_limit_that_the_servo_has(tmp_path: Path) -> None:
     assert made.joint == "hip_fl"
     assert made.loaded_s < 300
     assert "37 °C, 3 K below its limit" in made.words
+
+
+def test_enough_ends_the_cooling_and_not_the_load(tmp_path: Path) -> None:
+    class Impatient:
+        """Says "enough" whenever it may."""
+
+        def answer(self, event: Event) -> Answer:
+            return True if isinstance(event, Live) else None
+
+    with robot(tmp_path / "ant", **DOZING) as there:
+        plan = SoakPlan(load="hang", seconds=60.0, cool_down_s=600.0)
+        made = drive(run_soak(plan, tmp_path / "soak.mcap", there), Impatient())
+        assert not any(there.torque())
+    assert (made.why, made.loaded_s) == ("time", pytest.approx(60.0, abs=1.0))
+    recording = read_recording(tmp_path / "soak.mcap")
+    assert 65.0 < recording.run.duration_s < 90.0
+    assert recording.events == ()
+    assert recording.damage is None
 
 
 def test_the_engine_stops_a_hot_robot_that_nobody_watches(tmp_path: Path) -> None:
