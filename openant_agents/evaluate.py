@@ -21,7 +21,7 @@ from openant_agents.policies import Policy
 from openant_agents.training import in_time_with
 from openant_env.metrics import AverageReward
 from openant_tools.errors import BadInput
-from openant_tools.numbers import exact
+from openant_tools.numbers import exact, number
 
 __all__ = ["LIKELIEST", "SAMPLED", "Frame", "Plays", "PolicyPlay", "Way", "evaluate", "film"]
 
@@ -34,7 +34,6 @@ STILL_M = 0.01
 STILL_S = 5.0
 
 Frame = NDArray[np.uint8]
-Report = Callable[[float, float], None]
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,7 @@ def evaluate(
     seconds: float,
     starts: int,
     seed: int = 0,
-    report: Report | None = None,
+    progress: Callable[[float, str], None] = lambda share, words: None,
 ) -> Plays:
     """Play a policy from several starts.
 
@@ -136,7 +135,7 @@ def evaluate(
         seconds: s of robot time from each start.
         starts: how many resets: other headings in a simulation; a robot stands up where it is.
         seed: of the first start; each further one has the next.
-        report: called after each step with the robot time of all starts so far (s) and this one's average reward (m/s).
+        progress: called after each step with the share that is done; its words say what was achieved so far.
 
     Raises:
         BadInput: a time that is not above 0, or no start.
@@ -146,15 +145,15 @@ def evaluate(
             f"there is nothing to evaluate in {starts} × {exact(seconds, 's')}", remedy="give a time above 0"
         )
 
-    def played(number: int) -> PolicyPlay:
+    def played(start: int) -> PolicyPlay:
         def tell(done: float, average: float) -> None:
-            if report is not None:
-                report(number * seconds + done, average)
+            words = f"{way} {number(100 * average, 'cm/s', sign=True, decimals=1)}"
+            progress((start + done / seconds) / starts, words)
 
         with in_time_with(env):
-            return _play(env, policy, way, seconds, seed + number, tell, lambda: None)
+            return _play(env, policy, way, seconds, seed + start, tell, lambda: None)
 
-    return Plays(way, tuple(played(number) for number in range(starts)))
+    return Plays(way, tuple(played(start) for start in range(starts)))
 
 
 def film(env: gymnasium.Env[Any, Any], policy: Policy, *, way: Way, seconds: float, seed: int) -> list[Frame]:
@@ -170,7 +169,7 @@ def _play(
     way: Way,
     seconds: float,
     seed: int,
-    report: Report,
+    tell: Callable[[float, float], None],
     draw: Callable[[], None],
 ) -> PolicyPlay:
     act = policy.sample if way == SAMPLED else policy.likeliest
@@ -195,7 +194,7 @@ def _play(
         path += float(np.linalg.norm(np.nan_to_num(info["position"] - before["position"])))
         turns += bool((info["reward_direction"] != before["reward_direction"]).any())
         draw()
-        report(average.seconds, average.value)
+        tell(average.seconds, average.value)
         if terminated or truncated:
             helped[str(info.get("reason", "the episode ended"))] += 1
             observation, info = env.reset()

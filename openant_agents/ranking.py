@@ -12,31 +12,35 @@ With S_i the average reward of policy i in a simulation and R_i on the robot:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-from openant_agents.evaluate import LIKELIEST, SAMPLED, evaluate
-from openant_agents.exploits import Flag, TwitchCounter, flag
+from openant_agents.evaluate import LIKELIEST, SAMPLED, Plays, evaluate
+from openant_agents.exploits import DISTURBANCES, Flag, TwitchCounter, flag
+from openant_agents.places import Place
 from openant_agents.policies import load_policy
 from openant_agents.runs import read_facts
 from openant_tools.errors import BadInput
 from openant_tools.files import json_text, read_json, write_text
 from openant_tools.procedure.intervals import Interval
+from openant_tools.procedure.relay import part_of
 
 __all__ = [
-    "Agreement", "PlaceResult", "Ranking", "agreement", "check_names", "find_policies", "kendall", "play", "rank", "rank_violation",
+    "Agreement", "PlaceResult", "Ranking", "agreement", "check_names", "find_policies", "kendall", "play", "play_disturbed", "rank",
+    "rank_violation",
     "read_measured", "regret", "spearman", "write_measured",
 ]  # fmt: skip
 
 SCHEMA = "openant.policies/1"
 RESAMPLES = 2_000
+#: times fewer starts where a simulation is disturbed: what falls apart there is seen in a few
+FEWER = 5
 #: what the robot is called among the places of a ranking's file
 ROBOT = "real"
 
@@ -267,47 +271,48 @@ def find_policies(folder: Path) -> dict[str, Path]:
 
 
 def play(
-    run: Path,
-    make_env: Callable[[Mapping[str, Any]], gymnasium.Env[Any, Any]],
-    *,
-    seconds: float,
-    starts: int,
-    likeliest: bool = False,
-    report: Callable[[float], None] | None = None,
-) -> PlaceResult:
-    """Play a policy from some starts, with other headings each.
+    runs: Mapping[str, Path], place: Place, *, seconds: float, starts: int | None = None, likeliest: bool = False,
+    wrapper: Callable[[Any], Any] = lambda env: env,
+    progress: Callable[[float, str], None] = lambda share, words: None,
+) -> Iterator[tuple[str, PlaceResult]]:  # fmt: skip
+    """Play each policy in one place: its name and what it achieved, as soon as that is known.
 
     Args:
-        run: the policy's.
-        make_env: makes the place from how the policy's own environment was made (its `run.json`).
-        seconds: s of robot time from each start.
-        starts: how many.
-        likeliest: whether its likeliest action is played beside it.
-        report: called with the share done.
+        runs: name → training run. seconds: s of robot time from each start.
+        starts: how many, with other headings each; None for as many as the place asks for.
+        likeliest: whether the likeliest action is played beside it. wrapper: disturbs the place.
 
     Raises:
         BadInput: no such policy, or one that does not fit the place.
     """
-    ways = (SAMPLED, LIKELIEST) if likeliest else (SAMPLED,)
-    env = TwitchCounter(make_env(read_facts(run)["env"]))
-    try:
-        policy = load_policy(run, env)
-        done, reversals_hz = [], math.nan
-        for number, way in enumerate(ways):
+    ways, starts = (SAMPLED, LIKELIEST) if likeliest else (SAMPLED,), starts or place.starts
+    for number, (name, run) in enumerate(runs.items()):
+        env = TwitchCounter(wrapper(place.make(read_facts(run)["env"])))
+        try:
+            policy = load_policy(run, env)
+            done, reversals_hz = list[Plays](), math.nan
+            for way in ways:
+                words = f"{place.name}: {name} ({number + 1} of {len(runs)}), "
+                tell = part_of(progress, number * len(ways) + len(done), len(runs) * len(ways), words)
+                done.append(evaluate(env, policy, way=way, seconds=seconds, starts=starts, progress=tell))
+                if way == SAMPLED:
+                    reversals_hz = env.reversals_hz
+        finally:
+            env.close()
+        rewards, helped = done[0].rewards.tolist(), done[0].helped.total()
+        yield name, PlaceResult.of(rewards, reversals_hz, helped, done[1].as_dict() if likeliest else None)
 
-            def tell(played: float, average: float, number: int = number) -> None:
-                if report is not None:
-                    report((number + played / (starts * seconds)) / len(ways))
 
-            done.append(evaluate(env, policy, way=way, seconds=seconds, starts=starts, report=tell))
-            if way == SAMPLED:
-                reversals_hz = env.reversals_hz
-        sampled = done[0]
-        return PlaceResult.of(
-            sampled.rewards.tolist(), reversals_hz, sampled.helped.total(), done[1].as_dict() if likeliest else None
-        )
-    finally:
-        env.close()
+def play_disturbed(
+    runs: Mapping[str, Path], place: Place, *, seconds: float, starts: int | None,
+    progress: Callable[[float, str], None] = lambda share, words: None,
+) -> dict[str, dict[str, PlaceResult]]:  # fmt: skip
+    """What each policy achieves where a simulation is disturbed, by disturbance, from a fifth of the starts; as `play`."""
+    few = max(1, (starts or place.starts) // FEWER)
+    return {
+        words: dict(play(runs, place, seconds=seconds, starts=few, wrapper=wrapper, progress=progress))
+        for words, wrapper in DISTURBANCES.items()
+    }
 
 
 # ------------------------------------------------------------------------------------------------------------- files

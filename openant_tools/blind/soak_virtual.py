@@ -162,7 +162,7 @@ def swinging_soak(
     name: str,
     *,
     still: bool = False,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float, str], None] = lambda share, words: None,
 ) -> Run:
     """A soak of any scenario with the motion of `openant comms soak`, without bytes and ports."""
     scenario.world.body.timestep_s = max(scenario.world.body.timestep_s, STEP_S)
@@ -192,13 +192,12 @@ def record_transactions(
     name: str,
     *,
     motion: Callable[[float], Array],
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float, str], None] = lambda share, words: None,
 ) -> Run:
     """Move and read for `seconds` (s); the log as a run (formats, section 1).
 
     Args:
         motion: goal angles (joints,) rad at a time since the start.
-        progress: called with the share done.
     """
     world, rate = host.world, host.rate_hz
     setups = world.settings.servos
@@ -252,7 +251,7 @@ def _cycles(
     start: float,
     count: int,
     motion: Callable[[float], Array],
-    progress: Callable[[float], None],
+    progress: Callable[[float, str], None],
 ) -> Iterator[_Row]:
     world, line = host.world, host.world.line
     chance = np.random.default_rng([host.seed, 9])
@@ -305,8 +304,8 @@ def _cycles(
         free = max(known, deadline if lost else known, line.free_at)
         yield _Row(at, max(wake, 0.0), cmd_t, goal, blocks, words, rtt)
         if k % 1000 == 0:
-            progress(k / count)
-    progress(1.0)
+            progress(k / count, "soaking")
+    progress(1.0, "soaking")
 
 
 def _as_run(name: str, servos: list[Servo], rows: list[_Row], rate: float) -> Run:

@@ -21,6 +21,7 @@ from typing import IO, ClassVar
 
 from openant_tools.errors import BadInput, OpenAntError
 from openant_tools.files import json_text, read_json, write_text
+from openant_tools.procedure.relay import part_of
 from openant_tools.workers import PROGRESS, environment
 
 __all__ = ["Stage", "StageFailed", "StagedFolder", "openant", "remove", "words_of"]
@@ -119,10 +120,7 @@ class StagedFolder:
             if path.exists() and _older((path,), stage.inputs):
                 remove(path)
         for number, command in enumerate(stage.commands):
-
-            def tell(share: float, words: str, number: int = number) -> None:
-                progress((number + share) / len(stage.commands), words)
-
+            tell = part_of(progress, number, len(stage.commands))
             self.folder.mkdir(parents=True, exist_ok=True)
             with self.log.open("a", encoding="utf-8") as log:
                 log.write(f"$ {words_of(command)}\n")

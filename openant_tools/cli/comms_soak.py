@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -14,9 +13,6 @@ from openant_tools.cli.options import MINUTES, json_option, rate_option, robot_o
 from openant_tools.cli.progress import BarFace, progress_bar
 from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option
 from openant_tools.numbers import number, percent
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["soak"]
 
@@ -74,24 +70,6 @@ def soak(
       openant comms soak --virtual loose-plug.toml --out soak.mcap --minutes 2 --yes
       openant comms diagnose soak.mcap
     """
-    from openant_tools.errors import BadInput
-
-    if transactions:
-        if virtual_source is None:
-            raise BadInput("only a virtual robot can be asked without bytes", remedy="add --virtual [SCENARIO]")
-        given = context.get_parameter_source("rate_hz") is not click.core.ParameterSource.DEFAULT
-        _transactions(virtual_source, out, minutes * 60, rate_hz if given else TRANSACTIONS_HZ, still)
-        return
-    _on_the_bus(
-        out, minutes * 60, still, resume, every_cycle, anyway, yes, port, virtual_source, robot, rate_hz, json_file
-    )
-
-
-def _on_the_bus(
-    out: Path, seconds: float, still: bool, resume: bool, every_cycle: bool, anyway: bool, yes: bool,
-    port: str | None, virtual_source: str | None, robot: Path | None, rate_hz: float, json_file: Path | None,
-) -> None:  # fmt: skip
-
     from rich.console import Console
 
     from openant_tools.comms.soak import SWING_RAD, THIN_S
@@ -101,7 +79,13 @@ def _on_the_bus(
     from openant_tools.procedure.step import drive
     from openant_tools.recording.writer import recording_path
 
-    path = recording_path(out)
+    if transactions:
+        if virtual_source is None:
+            raise BadInput("only a virtual robot can be asked without bytes", remedy="add --virtual [SCENARIO]")
+        given = context.get_parameter_source("rate_hz") is not click.core.ParameterSource.DEFAULT
+        _transactions(virtual_source, out, minutes * 60, rate_hz if given else TRANSACTIONS_HZ, still)
+        return
+    path, seconds = recording_path(out), minutes * 60
     if path.exists() and not resume:
         raise BadInput("there is a soak already", where=path, remedy="go on with it by --resume, or name another file")
     if resume and not path.exists():
@@ -162,8 +146,6 @@ def _transactions(source: str, out: Path, seconds: float, rate_hz: float, still:
         )
     scenario = Scenario() if source == VIRTUAL_DEFAULT else load_scenario(Path(source))
     with progress_bar("soaking") as tell:
-        run = swinging_soak(
-            scenario, seconds, rate_hz, out.stem, still=still, progress=lambda share: tell(share, "soaking")
-        )
+        run = swinging_soak(scenario, seconds, rate_hz, out.stem, still=still, progress=tell)
     write_table(run, out)
     click.echo(f"{out}  {number(run.duration_s, 's', decimals=0)}, {len(run.t)} rows")

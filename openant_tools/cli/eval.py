@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from openant_agents.places import HARDWARE_ID, SIMULATED_ID, STARTS_IN_SIMULATION, STARTS_ON_A_ROBOT, simulated_options
 from openant_tools.cli.hardware import Moving
-from openant_tools.cli.log import aside
 from openant_tools.cli.options import SECONDS, json_option
+from openant_tools.cli.progress import progress_bar
 from openant_tools.cli.walking import (
-    HARDWARE_ID,
-    SIMULATED_ID,
     environment,
     hardware_options,
     hardware_robot,
@@ -26,14 +25,12 @@ from openant_tools.cli.walking import (
 )
 from openant_tools.errors import BadInput
 from openant_tools.numbers import number
-from openant_tools.workers import pass_on
+from openant_tools.procedure.relay import part_of
 
 if TYPE_CHECKING:
     from openant_agents.evaluate import Plays
     from openant_agents.policies import Policy
 
-#: starts that a policy is measured from, where nobody says how many
-STARTS_IN_SIMULATION, STARTS_ON_A_ROBOT = 15, 1
 #: s of walking that are filmed at most; pictures in a strip, and s between them
 FILM_S = 10.0
 STRIP_FRAMES = 8
@@ -101,8 +98,6 @@ def eval_(
     from openant_tools.cli.learning import need_agents
 
     need_agents()
-    from rich.progress import Progress
-
     from openant_agents.evaluate import LIKELIEST, SAMPLED, evaluate
     from openant_agents.policies import load_policy
     from openant_agents.runs import making_sense, read_facts
@@ -136,12 +131,8 @@ def eval_(
     elif virtual_source is not None:
         raise BadInput("--virtual is a robot behind its ports", remedy="add --env hardware")
     else:
-        for key in ("virtual", "clock", "record_pictures"):
-            options.pop(key, None)
-    if name == SIMULATED_ID and robot is not None:
-        options.pop("kit", None)
-        options["robot"] = os.path.abspath(robot)
-    elif not os.path.exists(options.get("robot", os.curdir)):
+        options = simulated_options(options, robot if name == SIMULATED_ID else None)
+    if (name != SIMULATED_ID or robot is None) and not os.path.exists(options.get("robot", os.curdir)):
         raise BadInput(
             f"the robot it was trained on is no longer at {options['robot']}", where=run, remedy="name it with --robot"
         )
@@ -155,19 +146,10 @@ def eval_(
         if options.get("robot") == trained_on:
             place_circle(env, run)
         found = []
-        with Progress(console=aside(), transient=True) as bar:
-            task = bar.add_task("walking", total=len(ways) * starts * seconds)
+        with progress_bar("walking") as bar:
             for played, way in enumerate(ways):
-
-                def tell(done: float, average: float, played: int = played, way: str = way) -> None:
-                    so_far, words = (
-                        played * starts * seconds + done,
-                        f"{way} {number(100 * average, 'cm/s', sign=True, decimals=1)}",
-                    )
-                    bar.update(task, completed=so_far, description=words)
-                    pass_on(so_far / (len(ways) * starts * seconds), words)
-
-                found.append(evaluate(env, policy, way=way, seconds=seconds, starts=starts, seed=seed, report=tell))
+                tell = part_of(bar, played, len(ways))
+                found.append(evaluate(env, policy, way=way, seconds=seconds, starts=starts, seed=seed, progress=tell))
         sampled = found[0]
         if strip is not None or video is not None:
             try:

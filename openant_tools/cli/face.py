@@ -54,7 +54,9 @@ class CommandFace:
     def answer(self, event: Event) -> Answer:
         """Show one event; what it is answered with."""
         if not isinstance(event, Live):
-            self._end_live()
+            self._live = 0
+        if isinstance(event, Intent | Hands | Ask):
+            self._watching = False
         match event:
             case Progress(share, words):
                 self._progress(share, words)
@@ -177,9 +179,6 @@ class CommandFace:
                 )
             self._live = len(live.values)
         return watched and _entered()
-
-    def _end_live(self) -> None:
-        self._live, self._watching = 0, False
 
 
 def _entered() -> bool:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from openant_tools.cli.eval import STARTS_IN_SIMULATION, STARTS_ON_A_ROBOT
+from openant_agents.places import STARTS_IN_SIMULATION, STARTS_ON_A_ROBOT, Place
 from openant_tools.cli.hardware import Moving
 from openant_tools.cli.learning import need_agents
-from openant_tools.cli.log import aside
 from openant_tools.cli.options import SECONDS, json_option, report_option, write_report
+from openant_tools.cli.progress import progress_bar
+from openant_tools.cli.walking import may_walk
 from openant_tools.errors import BadInput
 from openant_tools.numbers import number, percent
 
@@ -80,8 +80,9 @@ def play(
 
     runs = find_policies(folder)
     done = read_measured(json_file) if json_file.is_file() else {}
-    both = likeliest or not _on_robot(place)
-    for name, measured in _play(runs, place, seconds, starts, yes, known=done, likeliest=both):
+    left = {name: run for name, run in runs.items() if name not in done}
+    both = likeliest or not Place.named(place).is_robot
+    for name, measured in _play(left, place, seconds, starts, yes, likeliest=both):
         done[name] = measured
         write_measured(json_file, done, place=place, seconds=seconds)
         click.echo(f"{name:24} {_achieved(measured)}")
@@ -120,8 +121,7 @@ def rank(
         --sim nominal=nominal --sim calibrated=my-ant --sim diagnosed=my-ant-diagnosed --report ranking
     """
     need_agents()
-    from openant_agents.exploits import DISTURBANCES
-    from openant_agents.ranking import find_policies
+    from openant_agents.ranking import find_policies, play_disturbed
     from openant_agents.ranking import rank as ranked
     from openant_agents.ranking_report import ranking_report
     from openant_tools.files import json_text, write_text
@@ -138,9 +138,9 @@ def rank(
         chooser = flag_by or next(iter(places))
         worse: dict[str, dict[str, PlaceResult]] = {}
         if not places[chooser].endswith(".json"):
-            few = max(1, (starts or STARTS_IN_SIMULATION) // 5)
-            for words, wrapper in DISTURBANCES.items():
-                worse[words] = dict(_play(runs, places[chooser], seconds, few, False, wrapper=wrapper))
+            where = _place(places[chooser], False)
+            with progress_bar(where.name) as tell:
+                worse = play_disturbed(runs, where, seconds=seconds, starts=starts, progress=tell)
         found = found.flagged(chooser, worse)
     _print(found)
     if report is not None:
@@ -189,43 +189,26 @@ def _simulations(given: tuple[str, ...]) -> dict[str, str]:
 
 
 def _play(
-    runs: Mapping[str, Path],
-    place: str,
-    seconds: float,
-    starts: int | None,
-    yes: bool,
-    *,
-    known: Mapping[str, PlaceResult] | None = None,
-    likeliest: bool = False,
-    wrapper: Callable[[Any], Any] | None = None,
-) -> Any:
+    runs: Mapping[str, Path], place: str, seconds: float, starts: int | None, yes: bool, *, likeliest: bool = False
+) -> Iterator[tuple[str, PlaceResult]]:
     """(name, what it achieved) of each policy, with progress; from a file where the place is one."""
-    from rich.progress import Progress
-
-    from openant_agents.ranking import play as play_one
+    from openant_agents.ranking import play as played
     from openant_agents.ranking import read_measured
 
     if place.endswith(".json"):
-        measured = read_measured(Path(place))
-        yield from ((name, one) for name, one in measured.items() if name in runs)
+        yield from ((name, one) for name, one in read_measured(Path(place)).items() if name in runs)
         return
-    make = _maker(place, yes)
-    starts = starts or (STARTS_ON_A_ROBOT if _on_robot(place) else STARTS_IN_SIMULATION)
+    where = _place(place, yes)
+    with progress_bar(place) as tell:
+        yield from played(runs, where, seconds=seconds, starts=starts, likeliest=likeliest, progress=tell)
 
-    def made(facts: Mapping[str, Any]) -> Any:
-        return make(facts) if wrapper is None else wrapper(make(facts))
 
-    with Progress(console=aside(), transient=True) as bar:
-        task = bar.add_task(place, total=1.0)
-
-        def tell(share: float) -> None:
-            bar.update(task, completed=share)
-
-        for at, (name, run) in enumerate(runs.items(), start=1):
-            if known and name in known:
-                continue
-            bar.update(task, completed=0.0, description=f"{place}: {name} ({at} of {len(runs)})")
-            yield name, play_one(run, made, seconds=seconds, starts=starts, likeliest=likeliest, report=tell)
+def _place(name: str, yes: bool) -> Place:
+    """Where to play; a robot only where it may walk."""
+    place = Place.named(name)
+    if place.is_hardware:
+        may_walk(place.options, yes)
+    return place
 
 
 def _achieved(measured: PlaceResult) -> str:
@@ -240,42 +223,3 @@ def _achieved(measured: PlaceResult) -> str:
         if likeliest["stood_still"]:
             words += f" (stood still for good in {number(likeliest['stood_still'])} of {starts})"
     return words
-
-
-def _on_robot(place: str) -> bool:
-    """Whether a place is a robot behind its ports, which starts where it stands."""
-    return place.partition(":")[0] in ("virtual", "hardware")
-
-
-def _maker(place: str, yes: bool) -> Callable[[Mapping[str, Any]], Any]:
-    """How to make an environment of a place, with the task, step and range of actions that a policy was trained with.
-
-    Raises:
-        BadInput: no such place, or a robot that may not move.
-    """
-    import gymnasium
-
-    import openant_env  # noqa: F401  (registers the environments)
-    from openant_tools.cli.walking import HARDWARE_ID, SIMULATED_ID, may_walk
-
-    kind, _, rest = place.partition(":")
-    name, chosen = SIMULATED_ID, {}
-    if place == "nominal" or kind == "nominal":
-        chosen = {"kit": rest or "standard"}
-    elif kind in ("virtual", "hardware"):
-        name = HARDWARE_ID
-        if kind == "virtual":
-            chosen = {"virtual": rest if rest == "default" else os.path.abspath(rest)}
-        else:
-            chosen = {"robot": os.path.abspath(rest)}
-            may_walk(chosen, yes)
-    elif os.path.exists(place):
-        chosen = {"robot": os.path.abspath(place)}
-    else:
-        raise BadInput(f"there is no such place: {place}", remedy="see `openant policies --help` for what a place is")
-
-    def make(facts: Mapping[str, Any]) -> Any:
-        kept = {key: facts["options"][key] for key in ("task", "dt", "action_range") if key in facts["options"]}
-        return gymnasium.make(name, max_episode_steps=-1, **kept, **chosen)
-
-    return make

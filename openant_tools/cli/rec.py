@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from openant_tools.cli.log import aside, mention
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import json_option
+from openant_tools.cli.progress import progress_bar
 from openant_tools.errors import BadInput
 from openant_tools.numbers import number, percent, span
 
@@ -243,16 +244,12 @@ def import_(
         return
     if calibration is not None or names or units is not None:
         raise BadInput("--calibration, --joints and --units are of LeRobot's datasets", remedy="add --from lerobot")
-    from rich.progress import Progress
-
     from openant_tools.recording.convert import import_run
     from openant_tools.recording.tables import read_run
 
     run = read_run(source, need=())
-    console = aside()
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(f"importing {run.name}", total=1.0)
-        path = import_run(run, out, progress=lambda share: bar.update(task, completed=share))
+    with progress_bar() as progress:
+        path = import_run(run, out, progress=progress)
     click.echo(f"{path}: {len(run.t)} rows of {', '.join(run.joints)}")
 
 

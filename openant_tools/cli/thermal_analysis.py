@@ -67,19 +67,7 @@ def fit(
             f"at most ({held.worst}); {percent(held.within)} of it inside the 95 % band"
         )
     if json_file is not None:
-        _write(json_file, {
-            "schema": "openant.thermal-fit/1", "runs": [str(path) for path in runs],
-            "parameters": {
-                f"{one.joint}.{one.name}" if one.joint else one.name: {
-                    "value": one.value, "low": one.low, "high": one.high, "unit": one.unit, "informed": one.informed,
-                }
-                for one in found.estimates
-            },
-            "held_out": None if held is None else vars(held),
-            "disturbance": {"deviation_k": found.disturbance_k, "time_s": found.disturbance_s},
-            "glitches": dict(zip(inputs[-1].joints, map(int, inputs[-1].glitches), strict=True)),
-            "known": found.known.as_json(),
-        })  # fmt: skip
+        _write(json_file, {**found.as_json(held), "runs": [str(path) for path in runs]})
     folder = _folder(robot)
     then = found.at(inputs[-1].loaded_s)
     told = look_ahead(then, from_cold=True) if report is not None or folder is not None else None
@@ -89,11 +77,11 @@ def fit(
         write_report(fit_report(found, told, inputs, held), report, runs)
     if folder is not None and told is not None:
         from openant_tools.procedure.finding import keep
-        from openant_tools.thermal.finding import thermal_finding
+        from openant_tools.thermal.finding import thermal_finding, warning_of
 
         finding = thermal_finding(
             then, told, command=command_line(), recording=folder.relative(runs[-1]), held=held,
-            rest=rest_advice(then), warning=_warning(folder),
+            rest=rest_advice(then), warning=warning_of(folder.config()),
         )  # fmt: skip
         mention(f"wrote {keep(finding, folder, folder.relative(runs[-1]))}")
     return 1 if held is not None and held.rms_k > BELIEVED_K else 0
@@ -146,35 +134,18 @@ def forecast(
     Exit code 1: a servo is more likely than not to shut down.
     """
     from openant_tools.errors import BadInput
+    from openant_tools.thermal.finding import keep_derating, warning_of
     from openant_tools.thermal.fit import Known
-    from openant_tools.thermal.fit import fit as fit_runs
-    from openant_tools.thermal.forecast import (
-        HORIZON_S,
-        cool_down,
-        derating,
-        present_load,
-        rest_advice,
-        torque_load,
-    )  # fmt: skip
-    from openant_tools.thermal.forecast import forecast as look_ahead
+    from openant_tools.thermal.forecast import outlook
 
     inputs = _read(run)
-    known = None if after is None else Known.read(after)
-    if at_min is not None and at_min * 60 > inputs.duration_s + 1:
-        raise BadInput(
-            f"the run ends after {number(inputs.duration_s / 60, 'min', decimals=1)}",
-            where=run,
-            remedy="give --at less",
-        )
-    if at_min is not None:
-        found = fit_runs([inputs.until(at_min * 60)], after=known)
-    else:
-        found = fit_runs([inputs], after=known).at(inputs.loaded_s)
-    load = torque_load(found, _torques(loads)) if loads else present_load(found, whole=whole)
-    told = look_ahead(found, load, from_cold=from_cold)
-    rest = rest_advice(found, load)
+    ahead = outlook(
+        inputs, after=None if after is None else Known.read(after), at_s=None if at_min is None else 60 * at_min,
+        torque_nm=_torques(loads), whole=whole, from_cold=from_cold,
+    )  # fmt: skip
+    found, told, rest, rules = ahead.found, ahead.told, ahead.rest, ahead.rules.joints
     since = "from cold" if from_cold else f"from {number(found.inputs.duration_s / 60, 'min', decimals=1)} on"
-    click.echo(f"{load.words}, {since}:")
+    click.echo(f"{told.load.words}, {since}:")
     for one in told.joints:
         torque = one.continuous_torque_nm
         hold = "" if torque is None else f"; {number(torque.value, 'N·m', torque.low, torque.high)} for ever"
@@ -182,39 +153,31 @@ def forecast(
             hold += f", {number(one.hour_torque_nm.value, decimals=2)} for an hour"
         click.echo(f"  {one.words} (now {number(one.temperature_c, '°C', decimals=0)}){hold}")
     click.echo(f"advice: {rest.words}")
-    cooling = {}
-    for one in told.joints:
-        interval = cool_down(found, one.joint)
-        if interval.value > 0:
-            cooling[one.joint] = interval
-            click.echo(
-                f"  {one.joint} has cooled {number(interval.value / 60, 'min', decimals=0)} after torque goes off"
-            )
-    rules = derating(found, load, told=told)
-    for joint, rule in rules.joints.items():
+    for joint, interval in ahead.cooling.items():
+        click.echo(f"  {joint} has cooled {number(interval.value / 60, 'min', decimals=0)} after torque goes off")
+    for joint, rule in rules.items():
         click.echo(
             f"  derating {joint}: all of its torque up to {number(rule.start_c, '°C', decimals=0)}, {percent(rule.least)} of it from {number(rule.stop_c, '°C', decimals=0)} on"
         )
     folder = _folder(robot)
-    if warning := None if folder is None else _warning(folder):
+    if warning := None if folder is None else warning_of(folder.config()):
         click.echo(warning)
     if derate:
         if folder is None:
             raise BadInput("no robot to write the rule to", remedy="name it with --robot DIR")
-        _keep_rules(folder, rules.as_table(), run)
+        if rules:
+            keep_derating(ahead.rules, folder, run, command_line())
+            mention(f"wrote {folder.config_file}")
+        else:
+            mention("no servo needs derating under this load; robot.toml is left as it is")
     if json_file is not None:
-        _write(json_file, {
-            "schema": "openant.thermal-forecast/1", "run": str(run), "load": load.words,
-            "at_s": found.inputs.duration_s, "horizon_s": HORIZON_S, "from_cold": from_cold,
-            "joints": [one.as_json() for one in told.joints], "rest": vars(rest), "derating": rules.as_table(),
-            "cool_down_s": {joint: interval.as_json() for joint, interval in cooling.items()},
-        })  # fmt: skip
+        _write(json_file, {**ahead.as_json(), "run": str(run)})
     if report is not None:
         from openant_tools.thermal.report import forecast_report
 
         shown = None if at_min is None or from_cold else inputs
         write_report(forecast_report(found, told, rest.words, shown), report, [run])
-    return 1 if any(one.probability > 0.5 for one in told.joints) else 0
+    return 1 if ahead.shuts_down else 0
 
 
 @click.command()
@@ -222,7 +185,7 @@ def forecast(
 @click.argument("b", type=click.Path(path_type=Path), metavar="[B]", required=False)
 @click.option(
     "--joint",
-    "pairs",
+    "joints",
     multiple=True,
     metavar="JOINT[:OTHER]",
     help="Only this joint, or A's against another of B; repeatable.",
@@ -231,7 +194,7 @@ def forecast(
 @json_option
 @report_option
 def compare(
-    a: Path, b: Path | None, pairs: tuple[str, ...], paper: bool, json_file: Path | None, report: Path | None
+    a: Path, b: Path | None, joints: tuple[str, ...], paper: bool, json_file: Path | None, report: Path | None
 ) -> int:
     """Two soaks: with and without heat sink, two motors, two dates; or one soak against the paper's curves.
 
@@ -250,39 +213,28 @@ def compare(
     if (b is None) == (not paper):
         raise BadInput("name two soaks, or one and --paper", remedy="openant thermal compare A B")
     one = fit_runs([_read(a)])
+    content: dict[str, Any] = {"schema": "openant.thermal-compare/1", "a": str(a)}
     if b is None:
         beside = against_paper(one.at(one.inputs.loaded_s))
         click.echo(beside.words)
-        if json_file is not None:
-            _write(json_file, {
-                "schema": "openant.thermal-compare/1", "a": str(a), "paper": beside.words, "joint": beside.joint,
-                "later_s": None if beside.later_s is None else beside.later_s.as_json(),
-                "above_limit_k": beside.above_limit_k.as_json(),
-            })  # fmt: skip
-        return 0
-    chosen = None
-    if pairs:
-        chosen = {first: second or first for first, _, second in (pair.partition(":") for pair in pairs)}
-    differences = subtract(one, fit_runs([_read(b)]), joints=chosen)
-    for d in differences:
-        click.echo(
-            f"{d.joint:9} at {number(d.torque_nm, 'N·m', decimals=2)}: {number(d.a_c.value, decimals=0)} → {number(d.b_c.value, '°C', decimals=0)}, "
-            f"{number(d.difference_k.value, 'K', d.difference_k.low, d.difference_k.high, sign=True)}{' *' if d.certain else ''}"
-        )
-    click.echo("* beyond what either soak leaves open (95 %)")
+        content |= beside.as_json()
+    else:
+        pairs = [(first, second or first) for first, _, second in (pair.partition(":") for pair in joints)]
+        differences = subtract(one, fit_runs([_read(b)]), joints=dict(pairs) or None)
+        for d in differences:
+            click.echo(
+                f"{d.joint:9} at {number(d.torque_nm, 'N·m', decimals=2)}: {number(d.a_c.value, decimals=0)} → {number(d.b_c.value, '°C', decimals=0)}, "
+                f"{number(d.difference_k.value, 'K', d.difference_k.low, d.difference_k.high, sign=True)}{' *' if d.certain else ''}"
+            )
+        click.echo("* beyond what either soak leaves open (95 %)")
+        content |= {"b": str(b), "joints": [d.as_json() for d in differences]}
     if json_file is not None:
-        _write(json_file, {
-            "schema": "openant.thermal-compare/1", "a": str(a), "b": str(b),
-            "joints": [
-                {"joint": d.joint, "torque_nm": d.torque_nm, "a_c": d.a_c.as_json(), "b_c": d.b_c.as_json(),
-                 "difference_k": d.difference_k.as_json(), "time_constant_s": d.time_constant_s.as_json(), "certain": d.certain}
-                for d in differences
-            ],
-        })  # fmt: skip
+        _write(json_file, content)
     if report is not None:
-        from openant_tools.thermal.report import compare_report
+        from openant_tools.thermal.report import compare_report, paper_report
 
-        write_report(compare_report(differences, a.name, b.name), report, [a, b])
+        page = paper_report(beside, a.name) if b is None else compare_report(differences, a.name, b.name)
+        write_report(page, report, [a] if b is None else [a, b])
     return 0
 
 
@@ -304,33 +256,6 @@ def _folder(robot: Path | None) -> RobotFolder | None:
     from openant_tools.robot.folder import RobotFolder
 
     return None if robot is None else RobotFolder.at(robot)
-
-
-def _warning(folder: RobotFolder) -> str | None:
-    """What the torque table says before anything is hot."""
-    from openant_tools.robot.kit import kit
-    from openant_tools.thermal.finding import torque_warning
-
-    config = folder.config()
-    knees = [(motor.joint, motor.servo) for motor in config.motors.values() if motor.kind == "knee"]
-    parts = kit(config.kit)
-    return torque_warning(knees, parts, supply_v=parts.supply_v, pwm_limit=config.bus.pwm_limit)
-
-
-def _keep_rules(folder: RobotFolder, rules: dict[str, dict[str, float]], run: Path) -> None:
-    """Put the rules into robot.toml, each with where it came from."""
-    import datetime
-
-    from openant_tools.robot.config import Provenance
-
-    if not rules:
-        mention("no servo needs derating under this load; robot.toml is left as it is")
-        return
-    now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
-    source = Provenance("forecast", command_line(), folder.relative(run), now)
-    values = {f"derating.{joint}.{key}": value for joint, rule in rules.items() for key, value in rule.items()}
-    folder.update(values, provenance={f"derating.{joint}": source for joint in rules})
-    mention(f"wrote {folder.config_file}")
 
 
 def _torques(loads: tuple[str, ...]) -> dict[str, float]:

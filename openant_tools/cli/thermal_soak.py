@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,21 +15,10 @@ from openant_tools.cli.virtual_for_command import placeable, placed, virtual_opt
 from openant_tools.numbers import exact, number, percent
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
-    from openant_tools.comms.messages import EngineConfig
     from openant_tools.robot.folder import RobotFolder
-    from openant_tools.thermal.soak import HeatSoaked, Sample, SoakPlan
+    from openant_tools.thermal.soak import SoakPlan
 
 __all__ = ["soak"]
-
-_BARS = "▁▂▃▄▅▆▇█"
-_PLAIN_BARS = "_.,-=+*#"
-#: points of a live curve
-CURVE = 32
-#: s between two drawings of the live table, and between two lines where no terminal is attached
-DRAW_S, LINE_S = 0.25, 20.0
 
 
 @click.command(cls=Moving)
@@ -124,12 +111,13 @@ def soak(
 
     Exit code 1: a servo came so near its limit that the load ended early.
     """
-    from rich.console import Console
-
+    from openant_tools.cli.thermal_curves import Curves
     from openant_tools.errors import BadInput
+    from openant_tools.procedure.step import drive
     from openant_tools.recording.writer import recording_path
     from openant_tools.robot.joints import JOINT_NAMES
-    from openant_tools.thermal.soak import SoakPlan, pose_angles, resume_plan
+    from openant_tools.thermal.soak import SoakPlan, pose_angles, resume_plan, soak_config
+    from openant_tools.thermal.soak import soak as run_soak
 
     out = recording_path(out)
     if resume:
@@ -155,22 +143,31 @@ def soak(
         )
         for pose in plan.poses:
             pose_angles(pose, JOINT_NAMES)
-    console = Console(stderr=True, highlight=False)
+    face = Curves(yes=yes)
+    console = face.console
     folder = robot_of(robot, needed=virtual_source is None)
     if not resume and commands is not None and commands.is_dir():
-        from openant_tools.cli.policy_commands import policy_commands
-
-        plan = replace(plan, commands=str(policy_commands(commands, out, folder)))
+        plan = replace(plan, commands=str(_walked(commands, out, folder)))
     with contextlib.ExitStack() as stack:
-        config = _connected(
-            stack, plan, virtual_source, port, folder, rate_hz or (50.0 if plan.load == "play" else 5.0), anyway
-        )
+        if virtual_source is not None and placeable(virtual_source):
+            virtual_source = stack.enter_context(placed(virtual_source, plan.setup, doze=True))
+        config = stack.enter_context(engine_config(folder, port, virtual_source, anyway=anyway))
+        config = soak_config(config, rate_hz or (50.0 if plan.load == "play" else 5.0), plan.margin_k)
         console.print(
             f"{'going on with ' if resume else ''}{_words(plan)}, {exact(plan.seconds / 60, 'min')}, then {exact(plan.cool_down_s / 60)} "
             f"min of cooling. {'The knees press' if plan.load == 'stall' else 'All joints move'} on {config.port}."
         )
         may_move(yes)
-        made = _run(console, config, plan, out, folder, resume)
+        toml = None if folder is None else folder.config_file.read_text()
+        try:
+            with face.table:
+                made = drive(run_soak(config, plan, out, robot_toml=toml, resume=resume), face)
+        except BaseException:
+            if out.exists():
+                console.print(
+                    f"kept what was recorded: go on with `openant thermal soak --resume --out {out}`", markup=False
+                )
+            raise
     for joint, peak in made.peak_c.items():
         click.echo(
             f"{joint:9} {number(peak, '°C', decimals=0):>6} at most"
@@ -186,121 +183,21 @@ def soak(
     return 0 if made.why == "time" else 1
 
 
-def _connected(
-    stack: contextlib.ExitStack,
-    plan: SoakPlan,
-    virtual_source: str | None,
-    port: str | None,
-    folder: RobotFolder | None,
-    rate_hz: float,
-    anyway: bool,
-) -> EngineConfig:
-    from openant_tools.thermal.soak import soak_config
+def _walked(run: Path, out: Path, folder: RobotFolder | None) -> Path:
+    """What the policy of a training run commands in the simulation, as a table beside `out`."""
+    from openant_tools.cli.learning import need_agents
+    from openant_tools.cli.walking import environment
 
-    source = virtual_source
-    if source is not None and placeable(source):
-        source = stack.enter_context(placed(source, plan.setup, doze=True))
-    config = stack.enter_context(engine_config(folder, port, source, anyway=anyway))
-    return soak_config(config, rate_hz, plan.margin_k)
+    need_agents()
+    from openant_agents.places import SIMULATED_ID, simulated_options
+    from openant_agents.rollout import write_commands
+    from openant_agents.runs import read_facts
 
-
-def _run(
-    console: Console, config: EngineConfig, plan: SoakPlan, out: Path, folder: RobotFolder | None, resume: bool
-) -> HeatSoaked:
-    """Drive the soak and draw it; Ctrl-C says how to go on."""
-    from rich.live import Live
-
-    from openant_tools.thermal.soak import soak as soaking
-
-    steps = soaking(
-        config, plan, out, robot_toml=None if folder is None else folder.config_file.read_text(), resume=resume
-    )
-    curves = _Curves(console)
-    live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
-    drawn = said = -math.inf
-    try:
-        with live or contextlib.nullcontext():
-            while True:
-                sample = next(steps)
-                curves.take(sample)
-                now = time.monotonic()
-                if sample.words:
-                    console.print(sample.words, markup=False)
-                if live is not None and now - drawn > DRAW_S:
-                    drawn = now
-                    live.update(curves.table(sample), refresh=True)
-                elif live is None and now - said > LINE_S:
-                    said = now
-                    console.print(curves.line(sample), markup=False)
-    except StopIteration as end:
-        made: HeatSoaked = end.value
-        return made
-    except BaseException:
-        steps.close()
-        if out.exists():
-            console.print(
-                f"kept what was recorded: go on with `openant thermal soak --resume --out {out}`", markup=False
-            )
-        raise
-
-
-class _Curves:
-    """What the live table shows: newest values, and each servo's temperature so far as a strip."""
-
-    def __init__(self, console: Console) -> None:
-        self._bars = _BARS if (console.encoding or "").lower().startswith("utf") else _PLAIN_BARS
-        self._past: list[list[float]] = []
-
-    def take(self, sample: Sample) -> None:
-        self._past.append(sample.temperature_c.tolist())
-
-    def table(self, sample: Sample) -> Table:
-        from rich.table import Table
-
-        minutes = sample.seconds / 60
-        table = Table(
-            title=f"{sample.phase}, {number(minutes, 'min', decimals=1)}, {percent(sample.share)}",
-            title_justify="left",
-            box=None,
-        )
-        for name, justify in (
-            ("servo", "left"),
-            ("°C", "right"),
-            ("limit", "right"),
-            ("K/min", "right"),
-            ("effort", "right"),
-        ):
-            table.add_column(name, justify=justify)  # type: ignore[arg-type]
-        table.add_column("V", justify="right")
-        table.add_column("so far")
-        for k, joint in enumerate(sample.joints):
-            now, limit = sample.temperature_c[k], sample.limit_c[k]
-            colour = "red" if now >= limit - 5 else "yellow" if now >= limit - 15 else "default"
-            effort = sample.current_a[k] if math.isfinite(sample.current_a[k]) else sample.load[k]
-            unit = " A" if math.isfinite(sample.current_a[k]) else ""
-            table.add_row(
-                joint, f"[{colour}]{number(now, decimals=0)}[/{colour}]", number(limit, decimals=0),
-                "–" if math.isnan(sample.rate_k_min[k]) else number(sample.rate_k_min[k], sign=True, decimals=1),
-                "–" if math.isnan(effort) else f"{number(effort, sign=True, decimals=2)}{unit}", number(sample.volts[k], decimals=1), self._strip(k, limit),
-            )  # fmt: skip
-        return table
-
-    def line(self, sample: Sample) -> str:
-        warmest = max(range(len(sample.joints)), key=lambda k: sample.temperature_c[k] - sample.limit_c[k])
-        return (
-            f"{sample.phase} {number(sample.seconds / 60, 'min', decimals=1)} ({percent(sample.share)}): {sample.joints[warmest]} "
-            f"{number(sample.temperature_c[warmest], '°C', decimals=0)} of {number(sample.limit_c[warmest], decimals=0)}"
-        )
-
-    def _strip(self, k: int, limit: float) -> str:
-        """From the coldest reading to the limit."""
-        every = max(1, len(self._past) // CURVE)
-        values = [row[k] for row in self._past[::every] if math.isfinite(row[k])]
-        if not values:
-            return ""
-        low = min(values)
-        steps = len(self._bars) - 1
-        return "".join(self._bars[min(steps, max(0, round((v - low) / max(limit - low, 1.0) * steps)))] for v in values)
+    options = simulated_options(read_facts(run)["env"]["options"], None if folder is None else folder.path)
+    table = out.with_name(f"{out.stem}-policy.parquet")
+    with environment(SIMULATED_ID, options, run / "recordings") as env:
+        write_commands(env, run, table)
+    return table
 
 
 def _joints(names: tuple[str, ...]) -> tuple[str, ...]:

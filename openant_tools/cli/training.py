@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from openant_agents.places import HARDWARE_ID, SIMULATED_ID
 from openant_tools.bringup.gait import STEP_S, steps_of
 from openant_tools.cli.learning import LearningBar, kit_option, need_agents, robot_argument
 from openant_tools.cli.log import mention
 from openant_tools.cli.options import robot_option
 from openant_tools.cli.walking import (
-    HARDWARE_ID,
-    SIMULATED_ID,
     environment,
     hardware_options,
     hardware_robot,

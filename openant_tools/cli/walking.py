@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from openant_agents.places import HARDWARE_ID
 from openant_tools.cli.hardware import may_move, record_pictures_option
 from openant_tools.cli.learning import robot_argument
 from openant_tools.cli.log import mention
@@ -21,9 +22,7 @@ from openant_tools.errors import BadInput
 if TYPE_CHECKING:
     from openant_env.hardware import AntHardware
 
-__all__ = ["HARDWARE_ID", "SIMULATED_ID", "environment", "hardware_options", "hardware_robot", "may_walk"]
-
-SIMULATED_ID, HARDWARE_ID = "openant/Ant-v0", "openant/AntHardware-v0"
+__all__ = ["environment", "hardware_options", "hardware_robot", "may_walk"]
 
 
 def hardware_options(command: Callable[..., Any]) -> Callable[..., Any]:

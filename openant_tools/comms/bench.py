@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 from openant_tools.comms.bus import Bus
@@ -97,21 +97,18 @@ def measure_rate(bus: Bus, ids: Sequence[int], seconds: float = 3.0) -> RateTria
     return RateTrial(cycles, took, cycles / took, limit, lost / max(1, cycles * len(ids)))
 
 
-def measure_gap(
-    bus: Bus, ids: Sequence[int], progress: Callable[[float], None] = lambda share: None
-) -> tuple[list[GapTrial], float | None]:
+def measure_gap(bus: Bus, ids: Sequence[int]) -> tuple[list[GapTrial], float | None]:
     """Failed reads per quiet time after a write; and the smallest gap from which on none fails, or None."""
     values = {id: bus.read(id, HARMLESS_ADDRESS, HARMLESS_SIZE) for id in ids}
     kept, trials = bus.timing, list[GapTrial]()
     try:
-        for k, gap in enumerate(GAPS_S):
+        for gap in GAPS_S:
             bus.timing = replace(kept, write_read_gap_s=gap)
             failed = 0
             for _ in range(TRIES):
                 bus.sync_write(HARMLESS_ADDRESS, HARMLESS_SIZE, values)
                 failed += any(not answer.ok for answer in bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, ids))
             trials.append(GapTrial(gap, TRIES, failed))
-            progress((k + 1) / len(GAPS_S))
     finally:
         bus.timing = kept
     best = None

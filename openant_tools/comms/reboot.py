@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from openant_tools.comms import protocol2 as p2
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.silence import ERROR_STATUS, VOLTAGE, ask, diagnose, patient_ping, read_register
 from openant_tools.errors import HardwareFault
 from openant_tools.numbers import number, span
+from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.procedure.step import Intent, Procedure, RegisterChange, Say
 from openant_tools.robot.servo import HardwareError, hardware_errors
 
-__all__ = ["Latched", "latched", "reboot"]
+__all__ = ["reboot"]
 
 TEMPERATURE, TEMPERATURE_LIMIT, VOLTAGE_LIMITS, TORQUE_ENABLE = 146, 31, 32, 64
 #: K below its limit a servo must be, or it is back there at once
@@ -21,42 +21,51 @@ BOOT_S, LONGEST_S, SHOWS_S = 0.5, 3.0, 0.2
 OTHER_REMEDY = "power it off and on"
 
 
-@dataclass(frozen=True)
-class Latched:
-    """What keeps a servo from working.
+def reboot(bus: Bus, id: int, name: str, command: str) -> Procedure:
+    """Say what keeps a servo from working, and clear it where its cause is gone and that is granted; torque is off afterwards.
 
-    Attributes:
-        errors: the hardware errors that stand; empty for none.
-        refusal: why a reboot would not help now, in words; empty where it may.
-    """
-
-    errors: tuple[HardwareError, ...]
-    refusal: str = ""
-
-    @property
-    def names(self) -> str:
-        return " and ".join(error.name for error in self.errors)
-
-
-def latched(bus: Bus, id: int) -> Latched:
-    """The errors of a servo, and whether what caused them still stands.
+    Args:
+        name: of the servo, for people. command: the command that does it.
 
     Raises:
-        HardwareFault: it does not answer; the message says why.
+        HardwareFault: it does not answer, and the message says why; it does not come back, or its torque is not off.
     """
+    errors = _latched(bus, id)
+    for error in errors:
+        yield Say(f"{name} has switched itself off after {error.name}: {error.advice}", "warn")
+    if not errors:
+        return _finding(True, f"{name} has no hardware error: there is nothing to clear", errors, command)
+    if cause := _cause(bus, id):
+        return _finding(False, f"not rebooted, the error would come back: {cause}", errors, command)
+    yield Say(f"a reboot clears it, as does another way: {OTHER_REMEDY}")
+    off = RegisterChange(name, "torque_enable", None, 0, "off, and it stays so")
+    yield Intent(f"reboot {name}, which lets go of its joint", (off,))
+    left = _start_anew(bus, id)
+    if not left:
+        return _finding(True, f"{name} works again: {_names(errors)} is cleared, its torque is off", left, command)
+    remedy = f"{left[0].advice}; where it stays so, {OTHER_REMEDY}, or replace the servo"
+    return _finding(False, f"{name} reports {_names(left)} again at once → {remedy}", left, command)
+
+
+def _finding(ok: bool, what: str, errors: tuple[HardwareError, ...], command: str) -> Finding:
+    count = Evidence("hardware errors that stand", len(errors), "1", "register Hardware Error Status (70)", most=0)
+    return Finding("reboot", ok, what, (count,), "", command, problems=() if ok else (what,))
+
+
+def _names(errors: tuple[HardwareError, ...]) -> str:
+    return " and ".join(error.name for error in errors)
+
+
+def _latched(bus: Bus, id: int) -> tuple[HardwareError, ...]:
     status, _ = patient_ping(bus, id)
     value = None if status is None else read_register(bus, id, ERROR_STATUS, 1)
     if status is None or value is None:
         raise diagnose(bus, [id]).fault(bus.line.path)
-    return Latched(hardware_errors(value[0]), _cause(bus, id) if value[0] else "")
+    return hardware_errors(value[0])
 
 
-def reboot(bus: Bus, id: int) -> tuple[HardwareError, ...]:
-    """Start it anew; its torque is off afterwards. The errors that came back at once.
-
-    Raises:
-        HardwareFault: it does not come back, or its torque is not off.
-    """
+def _start_anew(bus: Bus, id: int) -> tuple[HardwareError, ...]:
+    """Start it anew; its torque is off afterwards. The errors that came back at once."""
     where = f"{bus.line.path}, servo {id}"
     bus.send(p2.reboot(id).encode())  # whether it answers depends on its Status Return Level
     started = bus.clock.now()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -97,7 +97,6 @@ class Scan:
 def scan(
     bus: Bus,
     bauds: Iterable[int] = BAUDS,
-    progress: Callable[[int], None] = lambda baud: None,
     *,
     known: Collection[int] = KNOWN,
     host: Host | None = None,
@@ -113,7 +112,6 @@ def scan(
     reader = bool(doubts)
     try:
         for baud in bauds:
-            progress(baud)
             bus.line.set_baud(baud)
             rate = _Rate(bus, baud == before or len(bauds) < 3, known, stolen=reader)
             try:
@@ -208,7 +206,7 @@ def _words(cause: str, **values: Any) -> str:
     return f"{trouble.says.format(**values)} → {trouble.do.format(**values)}"
 
 
-def scan_by_sdk(path: str, bauds: Iterable[int] = BAUDS, progress: Callable[[int], None] = lambda baud: None) -> Scan:
+def scan_by_sdk(path: str, bauds: Iterable[int] = BAUDS) -> Scan:
     """The same question asked by the vendor's SDK, which waits for 252 ids at each rate: about ten seconds.
 
     It tells neither collisions from silence nor who answers what; 4.5 Mbaud it does not know.
@@ -223,7 +221,6 @@ def scan_by_sdk(path: str, bauds: Iterable[int] = BAUDS, progress: Callable[[int
     found, doubts = list[Scanned](), _read_by_others(path)
     try:
         for baud in bauds:
-            progress(baud)
             if not port.setBaudRate(baud):
                 continue
             answers, result = packets.broadcastPing(port)

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from openant_tools.procedure.step import Answer, Event, Progress, Say, Subroutine
 
-__all__ = ["passing", "relayed", "within"]
+__all__ = ["part_of", "passing", "relayed", "within"]
 
 T = TypeVar("T")
 
@@ -78,3 +78,10 @@ def within(part: tuple[float, float], work: Subroutine[T]) -> Subroutine[T]:
     """Do the work as this part, from share to share, of a procedure, whose progress never goes back; its result."""
     begin, end = part
     return passing(work, lambda event: Progress(begin + (event.share or 0.0) * (end - begin), event.words))
+
+
+def part_of(
+    progress: Callable[[float, str], None], number: int, count: int, before: str = ""
+) -> Callable[[float, str], None]:
+    """What one of `count` equal parts of work, `number` from 0, tells its progress to; `before` stands before its words."""
+    return lambda share, words: progress((number + share) / count, before + words)

@@ -22,11 +22,12 @@ _FLAGS = ("ok", "torque")
 _NOT_REGISTERS = ("cmd", "torque", "ok", "err", "rtt")
 
 
-def import_run(run: Run, path: str | Path, *, progress: Callable[[float], None] | None = None) -> Path:
+def import_run(
+    run: Run, path: str | Path, *, progress: Callable[[float, str], None] = lambda share, words: None
+) -> Path:
     """Write `run` as a native recording, its values in SI as they are; returns the file's path.
 
-    The file appears when it is whole. Reading it gives the same rows and columns again. `progress` is called with the
-    share done, 0…1.
+    The file appears when it is whole. Reading it gives the same rows and columns again.
 
     Raises:
         BadInput: there is such a file already.
@@ -59,7 +60,7 @@ def import_run(run: Run, path: str | Path, *, progress: Callable[[float], None] 
             unfinished, facts=run.facts_at(path.parent), channels=channels, telemetry=telemetry, overwrite=True,
             clock=lambda: float(run.t[0]),
         ) as writer:  # fmt: skip
-            _write_rows(run, list(extra), telemetry, writer, progress or (lambda share: None))
+            _write_rows(run, list(extra), telemetry, writer, progress)
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -72,7 +73,7 @@ def _of_a_joint(name: str, run: Run) -> bool:
 
 
 def _write_rows(
-    run: Run, extra: list[str], telemetry: Telemetry, writer: RecordingWriter, progress: Callable[[float], None]
+    run: Run, extra: list[str], telemetry: Telemetry, writer: RecordingWriter, progress: Callable[[float, str], None]
 ) -> None:
     signals = {
         joint: [
@@ -87,7 +88,7 @@ def _write_rows(
     has_pose = any(name in run.columns for name in POSE_FIELDS.values())
     for row, t in enumerate(run.t.tolist()):
         if row % 1000 == 0:
-            progress(row / len(run.t))
+            progress(row / len(run.t), f"importing {run.name}")
         joints = {
             joint: {_FIELDS.get(signal, signal): value for signal, value in _valid(columns, row)}
             for joint, columns in signals.items()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from openant_tools.errors import BadInput
 from openant_tools.numbers import number
 from openant_tools.procedure.intervals import Interval
 from openant_tools.thermal.fit import Fit
-from openant_tools.thermal.forecast import forecast, present_load, settled, torque_load
+from openant_tools.thermal.forecast import HeatForecast, forecast, present_load, settled, torque_load
 
 __all__ = ["PAPER", "ROOM_C", "AgainstPaper", "JointDifference", "Paper", "against_paper", "compare"]
 
@@ -50,6 +51,11 @@ class JointDifference:
     def certain(self) -> bool:
         """Whether the difference's interval leaves zero out."""
         return self.difference_k.low > 0 or self.difference_k.high < 0
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            name: value.as_json() if isinstance(value, Interval) else value for name, value in vars(self).items()
+        } | {"certain": self.certain}
 
 
 def compare(a: Fit, b: Fit, *, joints: Mapping[str, str] | None = None) -> list[JointDifference]:
@@ -147,12 +153,23 @@ class AgainstPaper:
     Attributes:
         later_s: how much later it shuts down; None where the paper's did not, or this one is not expected to.
         above_limit_k: where it would settle, were there no limit, less the limit that the paper's knees touched.
+        paper: the test of the same knees. told: what comes of this robot's load.
     """
 
     joint: str
     later_s: Interval | None
     above_limit_k: Interval
     words: str
+    paper: Paper
+    told: HeatForecast
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "paper": self.words,
+            "joint": self.joint,
+            "later_s": None if self.later_s is None else self.later_s.as_json(),
+            "above_limit_k": self.above_limit_k.as_json(),
+        }
 
 
 def against_paper(found: Fit) -> AgainstPaper:
@@ -181,7 +198,8 @@ def against_paper(found: Fit) -> AgainstPaper:
     when = worst.seconds_to_limit
     if paper.shutdown_s is None or when is None:
         verdict = "" if paper.shutdown_s is None else ": it stays cooler than the paper's"
-        return AgainstPaper(worst.joint, None, above, f"Paper: {paper.words}. This robot: {here}, {settles}{verdict}.")
+        words = f"Paper: {paper.words}. This robot: {here}, {settles}{verdict}."
+        return AgainstPaper(worst.joint, None, above, words, paper, told)
     later = _less(when, paper.shutdown_s)
     if later.low > 0:
         verdict = "it lasts longer than the paper's"
@@ -190,9 +208,8 @@ def against_paper(found: Fit) -> AgainstPaper:
     else:
         verdict = "as the paper's, within the interval"
     span = number(later.value / 60, "min", later.low / 60, later.high / 60, sign=True)
-    return AgainstPaper(
-        worst.joint, later, above, f"Paper: {paper.words}. This robot: {here}, {span} from the paper's: {verdict}."
-    )
+    words = f"Paper: {paper.words}. This robot: {here}, {span} from the paper's: {verdict}."
+    return AgainstPaper(worst.joint, later, above, words, paper, told)
 
 
 def _less(interval: Interval, by: float) -> Interval:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 
 from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.robot.config import Provenance, RobotConfig
+from openant_tools.robot.derating import Derating
+from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.kit import Kit
+from openant_tools.robot.kit import kit as kit_by_name
 from openant_tools.robot.servo import ServoModel
 from openant_tools.sysid.bench.knee_torque import knee_loads
 from openant_tools.thermal.fit import Fit, HeldOut
 from openant_tools.thermal.forecast import HeatForecast, RestPlan
 
-__all__ = ["STEP", "thermal_finding", "torque_warning"]
+__all__ = ["STEP", "keep_derating", "thermal_finding", "torque_warning", "warning_of"]
 
 #: the walk's step
 STEP = "thermal"
@@ -123,6 +129,22 @@ def torque_warning(
         f"{worst.servo} knees bear {number(worst.torque_nm, 'N·m', decimals=2)} on two legs and hold {number(worst.nominal_nm, 'N·m', decimals=2)} for long: they "
         "will heat → walk with rests, or stand on four legs (`openant sysid torque` shows the table)"
     )
+
+
+def warning_of(config: RobotConfig) -> str | None:
+    """The same of a robot as its configuration describes it."""
+    knees = [(motor.joint, motor.servo) for motor in config.motors.values() if motor.kind == "knee"]
+    kit = kit_by_name(config.kit)
+    return torque_warning(knees, kit, supply_v=kit.supply_v, pwm_limit=config.bus.pwm_limit)
+
+
+def keep_derating(rules: Derating, folder: RobotFolder, run: Path, command: str) -> None:
+    """Write the rules that a run gave into `robot.toml`, each with where it came from."""
+    now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+    source = Provenance("forecast", command, folder.relative(run), now)
+    table = rules.as_table()
+    values = {f"derating.{joint}.{key}": value for joint, rule in table.items() for key, value in rule.items()}
+    folder.update(values, provenance={f"derating.{joint}": source for joint in table})
 
 
 #: 45°, the paper's stance

@@ -274,6 +274,22 @@ class Fit:
             out.append(HeatEstimate(name, joint, float(value), float(low), float(high), unit, share))
         return tuple(out)
 
+    def as_json(self, held: HeldOut | None) -> dict[str, Any]:
+        """With how it met what was held back, and what the next fit begins with (`Known.read`)."""
+        return {
+            "schema": "openant.thermal-fit/1",
+            "parameters": {
+                f"{one.joint}.{one.name}" if one.joint else one.name: {
+                    "value": one.value, "low": one.low, "high": one.high, "unit": one.unit, "informed": one.informed,
+                }
+                for one in self.estimates
+            },
+            "held_out": None if held is None else vars(held),
+            "disturbance": {"deviation_k": self.disturbance_k, "time_s": self.disturbance_s},
+            "glitches": dict(zip(self.inputs.joints, map(int, self.inputs.glitches), strict=True)),
+            "known": self.known.as_json(),
+        }  # fmt: skip
+
     def estimate(self, name: str, joint: str = "") -> HeatEstimate:
         return next(one for one in self.estimates if (one.name, one.joint) == (name, joint))
 

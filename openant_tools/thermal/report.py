@@ -6,21 +6,25 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from openant_tools.numbers import number, percent
 from openant_tools.procedure.intervals import Interval
 from openant_tools.report import Figure, KeyFigure, Mark, Report, ReportSummary, plots
 from openant_tools.report.parts import Tone
-from openant_tools.thermal.compare import ROOM_C, JointDifference
+from openant_tools.thermal.compare import ROOM_C, AgainstPaper, JointDifference
 from openant_tools.thermal.finding import BELIEVED_K
 from openant_tools.thermal.fit import PARAMETER_WORDS, Fit, HeldOut
 from openant_tools.thermal.forecast import HORIZON_S, HeatForecast
 from openant_tools.thermal.inputs import Inputs
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure as MatplotlibFigure
 
-__all__ = ["compare_report", "fit_report", "forecast_picture", "forecast_report", "temperature_picture"]
+__all__ = [
+    "compare_report", "fit_report", "forecast_picture", "forecast_report", "paper_report", "temperature_picture",
+]  # fmt: skip
 
 #: min that a picture looks ahead, at most
 SHOWN_MIN = 120.0
@@ -76,12 +80,7 @@ def forecast_picture(
             shown = minutes <= now + later
             inputs = found.inputs if run is None else run
             panel.plot(inputs.edges[1:] / 60, inputs.readings[:, k], ".", color=plots.INK, markersize=2.5, label="read")
-            for (low, high), alpha in (((0.025, 0.975), 0.22), ((0.25, 0.75), 0.35)):
-                panel.fill_between(
-                    minutes[shown], told.fan[low][shown, k], told.fan[high][shown, k], color=plots.BLUE, alpha=alpha,
-                    linewidth=0, label="95 %" if alpha < 0.3 else "50 %",
-                )  # fmt: skip
-            panel.plot(minutes[shown], told.fan[0.5][shown, k], color=plots.BLUE, label="median")
+            _fan(panel, told, k, shown, now)
             limit = found.inputs.limit_c[k]
             panel.axhline(limit, color=plots.VERMILLION, linewidth=0.9, label="limit")
             panel.axvline(now, color=plots.INK, linewidth=0.8, linestyle=":")
@@ -91,6 +90,17 @@ def forecast_picture(
         axes[-1, 0].set_xlabel(plots.axis_label("time", "min"))
         plots.legend(axes[0, 0])
     return figure
+
+
+def _fan(panel: Axes, told: HeatForecast, k: int, shown: NDArray[np.bool_], begin: float) -> None:
+    """What comes of a joint, of times that are `shown`, from `begin` (min) on."""
+    minutes = begin + told.t[shown] / 60
+    for (low, high), alpha in (((0.025, 0.975), 0.22), ((0.25, 0.75), 0.35)):
+        panel.fill_between(
+            minutes, told.fan[low][shown, k], told.fan[high][shown, k], color=plots.BLUE, alpha=alpha, linewidth=0,
+            label="95 %" if alpha < 0.3 else "50 %",
+        )  # fmt: skip
+    panel.plot(minutes, told.fan[0.5][shown, k], color=plots.BLUE, label="median")
 
 
 def _interesting(told: HeatForecast) -> list[str]:
@@ -281,3 +291,41 @@ def compare_report(differences: Sequence[JointDifference], a: str, b: str) -> Re
         ],
     )  # fmt: skip
     return report
+
+
+def paper_report(beside: AgainstPaper, name: str) -> Report:
+    """This robot's warmest knee from a cold start, beside the paper's of the same servo.
+
+    Args:
+        name: of the soak.
+    """
+    told, limit = beside.told, beside.paper.limit_c
+    k, one = next((k, one) for k, one in enumerate(told.joints) if one.joint == beside.joint)
+    figure, axes = plots.figure(1, 1, height=2.6)
+    with plots.style():
+        _fan(axes, told, k, told.t / 60 <= SHOWN_MIN, 0.0)
+        axes.axhline(limit, color=plots.VERMILLION, linewidth=0.9, label="limit")
+        if beside.paper.shutdown_s is not None:
+            axes.plot(beside.paper.shutdown_s / 60, limit, "o", color=plots.INK, label="the paper's shuts down")
+        axes.set_ylim(top=limit + 12)
+        axes.set_xlabel(plots.axis_label("time", "min"))
+        axes.set_ylabel(plots.axis_label("case", "°C"))
+        axes.set_title(beside.joint)
+        plots.legend(axes)
+    answer = ReportSummary(
+        beside.words,
+        Figure(figure, "This robot under its own load from a cold start: median, and the fan of what the soak leaves open."),
+        "Room and load may be others than the paper's, whose log is not open: a difference is of the robot and of what it bore.",
+        "Ask what another load or a rest would do: `openant thermal forecast`.",
+        _shutdown_tone(told),
+        [
+            KeyFigure("shuts down after", _minutes(one.seconds_to_limit), beside.joint),
+            KeyFigure("later than the paper's", "–" if beside.later_s is None else _later(beside.later_s)),
+            KeyFigure("settles beyond the limit by", _interval(beside.above_limit_k, "K")),
+        ],
+    )  # fmt: skip
+    return Report("A soak beside the paper's", name, answer)
+
+
+def _later(interval: Interval) -> str:
+    return number(interval.value / 60, "min", interval.low / 60, interval.high / 60, sign=True)

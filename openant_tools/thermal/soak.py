@@ -1,7 +1,6 @@
 """A soak: load the robot, keep every servo's temperature for minutes to hours, stop before its limit, and keep the cooling.
 
-The steps of a soak are samples that any face can show: `soak` is a generator of `Sample`, and its value what came of it.
-The recording knows the plan, so that after a crash `resume_plan` and `soak(…, resume=True)` make one recording of both parts.
+A soak is a procedure that any face can show, which ends its cooling early where the builder says "enough". The recording knows the plan, so that after a crash `resume_plan` and `soak(…, resume=True)` make one recording of both parts.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -24,6 +23,7 @@ from openant_tools.comms.messages import EngineConfig
 from openant_tools.comms.restart import MotionStopped, StopCause
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.numbers import number, percent
+from openant_tools.procedure.step import Live, Progress, Say, Subroutine
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run
@@ -37,10 +37,7 @@ __all__ = [
     "POSES",
     "HeatSoaked",
     "Load",
-    "Phase",
-    "Sample",
     "SoakPlan",
-    "Soaking",
     "pose_angles",
     "resume_plan",
     "soak",
@@ -66,6 +63,9 @@ BEGIN_K = 10.0
 HOT_S = 3.0
 #: A soak must outlive a noisy bus: s without an answer until a servo is given up.
 SILENT_S = 3.0
+
+#: what goes on without torque; °C where the bars of temperatures begin
+COOLING, COLD_C = "cooling, torque off; Enter: enough of it", 15.0
 
 #: name → angles by kind of joint, rad
 POSES: Mapping[str, Mapping[str, float]] = {
@@ -110,34 +110,6 @@ class SoakPlan:
 
 
 @dataclass(frozen=True)
-class Sample:
-    """Where a soak is.
-
-    Attributes:
-        phase: what goes on. seconds: since the load began, pauses of a resumed soak included.
-        share: of the whole that is done.
-        joints: names, in the order of the arrays.
-        temperature_c: (joints,) without telemetry errors. limit_c: (joints,) as the servos have it.
-        rate_k_min: (joints,) over the last minutes, NaN while too early.
-        current_a, load, duty, volts: (joints,) newest, NaN where there is none.
-        words: what just happened, "" mostly.
-    """
-
-    phase: Phase
-    seconds: float
-    share: float
-    joints: tuple[str, ...]
-    temperature_c: Array
-    limit_c: Array
-    rate_k_min: Array
-    current_a: Array
-    load: Array
-    duty: Array
-    volts: Array
-    words: str = ""
-
-
-@dataclass(frozen=True)
 class HeatSoaked:
     """What came of a soak.
 
@@ -157,9 +129,6 @@ class HeatSoaked:
     loaded_s: float
     peak_c: Mapping[str, float]
     glitches: Mapping[str, int]
-
-
-Soaking = Generator[Sample, None, HeatSoaked]
 
 
 def pose_angles(pose: str, joints: Sequence[str]) -> Array:
@@ -285,7 +254,7 @@ def soak(
     *,
     robot_toml: str | None = None,
     resume: bool = False,
-) -> Soaking:
+) -> Subroutine[HeatSoaked]:
     """Do it. Closed at any yield (Ctrl-C, a stop key) it leaves torque off and a recording that can be resumed.
 
     Args:
@@ -362,7 +331,7 @@ class _End:
 
 def _look_around(
     engine: EngineProcess, log: _Log, limits: Array, plan: SoakPlan, before: _SoFar, resume: bool
-) -> Generator[Sample, None, None]:
+) -> Subroutine[None]:
     """Read temperatures before anything moves; a soak that begins hot says nothing and risks a servo."""
     engine.ask(messages.LetPass(1.0))
     log.take(engine.telemetry())
@@ -377,7 +346,7 @@ def _look_around(
             + (" and --resume again" if resume else ""),
         )
     for words in engine.notices():
-        yield _sample(log, limits, before.phase, 0.0, 0.0, words)
+        yield Say(words)
 
 
 def _under_load(
@@ -389,7 +358,7 @@ def _under_load(
     loaded: float,
     played: Array | None,
     stepped: bool,
-) -> Generator[Sample, None, _End]:
+) -> Subroutine[_End]:
     """Until the time is over, a servo is too warm, or something stops it."""
     look = STEPPED_LOOK_S if stepped else LOOK_S
     total = plan.seconds + plan.cool_down_s
@@ -419,7 +388,7 @@ def _under_load(
             return _why_stopped(engine, log, limits, at + log.t - begun, stopped)
         log.take(engine.telemetry())
         loaded = at + log.t - begun
-        yield _sample(log, limits, "load", loaded, loaded / total, "; ".join(engine.notices()))
+        yield from _seen(log, limits, loaded, loaded / total, _doing(plan, pose), engine.notices())
         near = limits - log.temperature
         k = int(np.nanargmin(near)) if np.isfinite(near).any() else 0
         if plan.margin_k >= 0 and near[k] <= plan.margin_k:
@@ -442,9 +411,7 @@ def _why_stopped(engine: EngineProcess, log: _Log, limits: Array, loaded: float,
     return _End(loaded, why, joint, fault.what, released=True)
 
 
-def _press(
-    engine: EngineProcess, config: EngineConfig, plan: SoakPlan, log: _Log, limits: Array
-) -> Generator[Sample, None, None]:
+def _press(engine: EngineProcess, config: EngineConfig, plan: SoakPlan, log: _Log, limits: Array) -> Subroutine[None]:
     """Let the knees press down with the wanted duty; the position loop makes it of the error that it sees.
 
     Raises:
@@ -489,7 +456,7 @@ def _press(
                 remedy="let the robot lie on its belly, feet on the floor, and put more weight on it: 8 kg for the "
                 "standard robot, 5 kg for the Lite",
             )
-    yield _sample(log, limits, "load", 0.0, 0.0, f"the knees are stalled at {percent(plan.effort)} of full duty")
+    yield Say(f"the knees are stalled at {percent(plan.effort)} of full duty")
 
 
 def _cooling(
@@ -501,24 +468,55 @@ def _cooling(
     cooled: float,
     words: str,
     stepped: bool,
-) -> Generator[Sample, None, None]:
-    """Torque off; the recording goes on."""
+) -> Subroutine[None]:
+    """Torque off; the recording goes on until its time is over, or enough was seen."""
     look = STEPPED_LOOK_S if stepped else LOOK_S
     total = plan.seconds + plan.cool_down_s
     begun, at = log.t, cooled
+    yield Say(words)
     while cooled < plan.cool_down_s:
         engine.ask(messages.LetPass(min(look, plan.cool_down_s - cooled)))
         log.take(engine.telemetry())
         cooled = at + max(log.t - begun, 1e-6)
-        yield _sample(log, limits, "cool-down", loaded + cooled, min(1.0, (plan.seconds + cooled) / total), words)
-        words = "; ".join(engine.notices())
+        share = min(1.0, (plan.seconds + cooled) / total)
+        if (yield from _seen(log, limits, loaded + cooled, share, COOLING, engine.notices())):
+            return
 
 
-def _sample(log: _Log, limits: Array, phase: Phase, seconds: float, share: float, words: str) -> Sample:
-    return Sample(
-        phase, seconds, share, log.joints, log.temperature, limits, log.rate,
-        log.newest("cur"), log.newest("load"), log.newest("pwm"), log.newest("volt"), words,
-    )  # fmt: skip
+def _doing(plan: SoakPlan, pose: int) -> str:
+    """What goes on under load."""
+    if plan.load == "stall":
+        return "pressing"
+    if plan.load == "play":
+        return "moving"
+    name = plan.poses[pose]
+    return f"holding the {name} pose" if name in POSES else f"holding {name}"
+
+
+def _seen(
+    log: _Log, limits: Array, seconds: float, share: float, doing: str, notices: Iterable[str]
+) -> Subroutine[bool]:
+    """Show how far it is and how warm the servos are, `seconds` after the load began; whether that was enough."""
+    for words in notices:
+        yield Say(words)
+    yield Progress(share, doing)
+    known = {joint: float(v) for joint, v in zip(log.joints, log.temperature, strict=True) if math.isfinite(v)}
+    numbers = zip(log.rate, log.newest("cur"), log.newest("load"), log.newest("volt"), strict=True)
+    marks = {joint: _marks(*map(float, row)) for joint, row in zip(log.joints, numbers, strict=True)}
+    words = f"after {number(seconds / 60, 'min', decimals=1)}: temperature of each servo, up to where it switches off"
+    top = dict(zip(log.joints, map(float, limits), strict=True))
+    return (yield Live(known, "°C", words, dict.fromkeys(known, COLD_C), top, marks)) is True
+
+
+def _marks(rate_k_min: float, current_a: float, load: float, volts: float) -> str:
+    """What stands beside a temperature: how fast it rises, how hard the servo works, its supply."""
+    effort, unit = (load, "") if math.isnan(current_a) else (current_a, " A")
+    said = (
+        (rate_k_min, number(rate_k_min, "K/min", sign=True, decimals=1)),
+        (effort, f"{number(effort, sign=True, decimals=2)}{unit}"),
+        (volts, number(volts, "V", decimals=1)),
+    )
+    return ", ".join(words for value, words in said if math.isfinite(value))
 
 
 def _lie_down(engine: EngineProcess, config: EngineConfig) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from pathlib import Path
 
 from openant_tools.calib.wires import engine_config
@@ -11,15 +9,14 @@ from openant_tools.errors import BadInput
 from openant_tools.numbers import number
 from openant_tools.procedure.by_time import minutes, noted
 from openant_tools.procedure.finding import Finding
-from openant_tools.procedure.step import Ask, Bench, Intent, Live, Procedure, Progress, Say, Subroutine
+from openant_tools.procedure.step import Ask, Bench, Intent, Procedure, Say
 from openant_tools.procedure.unfinished import Parts, unfinished
 from openant_tools.recording.tables import read_run
-from openant_tools.robot.kit import kit as kit_by_name
-from openant_tools.thermal.finding import thermal_finding, torque_warning
+from openant_tools.thermal.finding import thermal_finding, warning_of
 from openant_tools.thermal.fit import fit_and_judge
 from openant_tools.thermal.forecast import forecast, rest_advice
 from openant_tools.thermal.inputs import inputs_of
-from openant_tools.thermal.soak import Phase, Soaking, SoakPlan, resume_plan, soak, soak_config
+from openant_tools.thermal.soak import SoakPlan, resume_plan, soak, soak_config
 
 __all__ = ["thermal_soak"]
 
@@ -29,9 +26,6 @@ DEFAULT_MIN, SHORTEST_MIN, LONGEST_MIN = 10.0, 1.0, 240.0
 RATE_HZ = 5.0
 #: share of the time under load that is kept of the cooling: it is what tells the case from the air
 COOLING_SHARE = 0.3
-#: what a phase of the soak is called while it lasts
-PHASES: Mapping[Phase, str] = {"load": "holding the home pose", "cool-down": "cooling, torque off; Enter: enough of it"}
-TEMPERATURES = "temperature of each servo, up to where it switches off"
 
 
 def _minutes(seconds: float) -> str:
@@ -41,10 +35,7 @@ def _minutes(seconds: float) -> str:
 
 def thermal_soak(bench: Bench) -> Procedure:
     """Hold the home pose on the stand, keep every temperature, and say what heat will do to this robot."""
-    config = bench.folder.config()
-    kit = kit_by_name(config.kit)
-    knees = [(motor.joint, motor.servo) for motor in config.motors.values() if motor.kind == "knee"]
-    warning = torque_warning(knees, kit, supply_v=kit.supply_v, pwm_limit=config.bus.pwm_limit)
+    warning = warning_of(bench.folder.config())
     if warning:
         yield Say(warning, "warn")
     path = bench.folder.recordings / "soak.mcap"
@@ -66,7 +57,7 @@ def thermal_soak(bench: Bench) -> Procedure:
         path.unlink(missing_ok=True)
     engine = soak_config(engine_config(bench, imu=None), RATE_HZ)
     text = bench.folder.config_file.read_text(encoding="utf-8")
-    yield from noted(_watched(soak(engine, plan, path, robot_toml=text, resume=resume)), parts)
+    yield from noted(soak(engine, plan, path, robot_toml=text, resume=resume), parts)
     parts.end()
     run = inputs_of(read_run(path, need=()))
     # What is forecast is the load, not the cooling after it.
@@ -89,19 +80,3 @@ def _left(bench: Bench, path: Path) -> SoakPlan | None:
     except BadInput:
         return None
     return plan if left.of == minutes(plan.seconds + plan.cool_down_s) else None
-
-
-def _watched(steps: Soaking) -> Subroutine[None]:
-    """Show a soak until it ends, or until enough of its cooling was seen."""
-    try:
-        for sample in steps:
-            if sample.words:
-                yield Say(sample.words)
-            known = {j: float(v) for j, v in zip(sample.joints, sample.temperature_c, strict=True) if math.isfinite(v)}
-            limits = dict(zip(sample.joints, map(float, sample.limit_c), strict=True))
-            yield Progress(sample.share, PHASES[sample.phase])
-            enough = yield Live(known, "°C", TEMPERATURES, dict.fromkeys(known, 15.0), limits)
-            if enough is True and sample.phase == "cool-down":
-                return
-    finally:
-        steps.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -58,7 +59,7 @@ def pusher() -> Policy:
 def test_a_gait_that_lives_on_chance_walks_sampled_and_stands_still_as_its_likeliest_action():
     told = []
     sampled, likeliest = (
-        evaluate(Line(), pusher(), way=way, seconds=20.0, starts=5, report=lambda *done: told.append(done))
+        evaluate(Line(), pusher(), way=way, seconds=20.0, starts=5, progress=lambda *done: told.append(done))
         for way in (SAMPLED, LIKELIEST)
     )
     assert [play.stood_still for play in likeliest.plays] == [True, False, True, False, True]
@@ -67,7 +68,8 @@ def test_a_gait_that_lives_on_chance_walks_sampled_and_stands_still_as_its_likel
     assert set(sampled.as_dict()) == {"median", "low", "high"}
     assert 0.0 < sampled.low < sampled.median < sampled.high < 0.06
     assert sampled.mean == pytest.approx(np.mean([play.progress_m / 20.0 for play in sampled.plays]))
-    assert told[-1][0] == pytest.approx(100.0)
+    assert told[-1][0] == pytest.approx(1.0)
+    assert re.fullmatch(r"likeliest \S+ cm/s", told[-1][1])
 
 
 def test_the_play_that_is_filmed_is_the_play_that_was_measured():

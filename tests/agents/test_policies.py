@@ -20,6 +20,7 @@ from openant_agents.curves import band, group_runs, read_run_curve
 from openant_agents.drops import DropWatch, find_drops, preceding
 from openant_agents.exploits import Late, Lossy, Smoothed, TwitchCounter, flag
 from openant_agents.interventions import Intervention, read_interventions
+from openant_agents.places import simulated_options
 from openant_agents.ranking import PlaceResult, agreement, kendall, rank_violation, read_measured, regret, spearman
 from openant_agents.runs import CurvePoint
 from openant_agents.sac import SacSettings, train
@@ -272,6 +273,12 @@ def test_policies_are_played_and_ranked_from_the_command_line(runs, tmp_path, ca
     assert "Regret: by how much the simulation" in page, "what its columns are is said beside them"
 
 
+def test_what_was_learned_on_a_robot_walks_in_its_simulation_without_the_robots_own_options(tmp_path):
+    on_robot = {"robot": "/ant", "dt": 0.12, "virtual": "default", "clock": "stepped", "record_pictures": True}
+    assert simulated_options(on_robot, None) == {"robot": "/ant", "dt": 0.12}
+    assert simulated_options({"kit": "lite"}, tmp_path) == {"robot": str(tmp_path)}
+
+
 def test_what_cannot_be_ranked_is_refused_in_one_line(runs, tmp_path, capsys):
     good = tmp_path / "good.json"
     good.write_text(json.dumps({"policies": {"one": 0.01, "two": 0.05, "three": 0.03}}))
@@ -287,6 +294,7 @@ def test_what_cannot_be_ranked_is_refused_in_one_line(runs, tmp_path, capsys):
         ((*rank, "--sim", f"a={tmp_path}/nan.json"), "a reward in it is no number"),
         ((*rank, "--sim", f"a={tmp_path}/few.json"), "a has no reward of three"),
         ((*rank, "--sim", "a=mars"), "there is no such place: mars"),
+        ((*rank, "--sim", f"a=hardware:{tmp_path}"), "would walk and nobody"),
         ((*rank, "--sim", f"a={good}", "--flag-by", "b"), "no simulation is called b"),
         (("policies", "play", "--policies", tmp_path, "--on", "nominal", "--json", "x"), "there are no policies here"),
         (("policies", "play", "--policies", runs, "--on", f"hardware:{tmp_path}", "--json", "x"), "would walk and nobody"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import json
 import os
 import re
@@ -11,6 +13,7 @@ import signal
 import stat
 import subprocess
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
@@ -22,10 +25,10 @@ import numpy as np
 import pytest
 from plants import drive, pendulum, run_of, sweep
 
-from openant_tools.cli import main
+from openant_tools.cli import face, main
 from openant_tools.cli import openant as manual
 from openant_tools.cli.face import CommandFace
-from openant_tools.procedure.step import Ask
+from openant_tools.procedure.step import Ask, Live, Progress
 from openant_tools.recording.tables import write_table
 
 OPENANT = (sys.executable, "-m", "openant_tools.cli")
@@ -136,6 +139,54 @@ def test_an_unknown_command_is_refused_and_a_near_one_suggested() -> None:
     assert "'nosuch'" in refusal(openant("nosuch"))
     assert "'fit'" in refusal(openant("sysid", "fitt"))
     assert "--rate" in refusal(openant("sysid", "record", "--rat", "3"))
+
+
+def commands(command: click.Command, path: str = "openant") -> Iterator[tuple[str, click.Command]]:
+    """Every command with what is typed for it."""
+    yield path, command
+    if isinstance(command, click.Group):
+        context = click.Context(command)
+        for name in command.list_commands(context):
+            found = command.get_command(context, name)
+            assert found is not None
+            yield from commands(found, f"{path} {name}")
+
+
+def ends(function: ast.FunctionDef) -> Iterator[int]:
+    """The lines on which a function may end in order: not by a fault, nor where another function within it ends."""
+    waiting: list[ast.AST] = [*function.body]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef | ast.Lambda):
+            continue
+        called = ast.unparse(node.func) if isinstance(node, ast.Call) else ""
+        if isinstance(node, ast.Return) or called == "SystemExit" or called.endswith(".exit"):
+            assert isinstance(node, ast.stmt | ast.expr)
+            yield node.lineno
+        waiting.extend(ast.iter_child_nodes(node))
+
+
+def test_no_command_that_is_asked_for_a_report_ends_before_it_has_written_one() -> None:
+    """Those that can be run in a moment are run with it elsewhere; what could end early is found in all of them."""
+    asked = {
+        path: command.callback
+        for path, command in commands(manual)
+        if any("--report" in option.opts for option in command.params)
+    }
+    assert {"openant thermal compare", "openant gap measure", "openant sysid fit", "openant policies rank"} <= set(
+        asked
+    )
+    for path, callback in asked.items():
+        assert callback is not None
+        [function] = ast.parse(textwrap.dedent(inspect.getsource(inspect.unwrap(callback)))).body
+        assert isinstance(function, ast.FunctionDef)
+        written = [
+            node.lineno for node in ast.walk(function)
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "write_report"
+        ]  # fmt: skip
+        assert written, f"{path} --report: it writes none"
+        early = [line for line in ends(function) if line < max(written)]
+        assert not early, f"{path} --report: it may end in line {early[0]} of its function without one"
 
 
 def test_the_version_is_printed() -> None:
@@ -461,3 +512,18 @@ def test_a_question_for_a_number_says_its_unit(
     said = capsys.readouterr()
     assert "Soak for how long? [min] (10.0): " in said.out + said.err
     assert "from 0 to 600 min" in said.out + said.err
+
+
+def test_enter_ends_what_is_watched_while_progress_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was typed before it was shown counts for nothing; what is typed between two pictures of it does."""
+    typed = [True]
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
+    monkeypatch.setattr(face, "_entered", lambda: bool(typed) and typed.pop())
+    shown = CommandFace(yes=False)
+    watched = Live({"hip_rr": 31.0}, "°C", "cooling")
+    assert shown.answer(watched) is False
+    shown.answer(Progress(0.5, "cooling"))
+    typed.append(True)
+    assert shown.answer(watched) is True
+    shown.answer(Progress(0.6, "cooling"))
+    assert shown.answer(watched) is False

@@ -23,12 +23,13 @@ from openant_tools.comms.bench import RateTrial
 from openant_tools.comms.clock import RealClock
 from openant_tools.comms.faults import NoAnswer
 from openant_tools.comms.ports import Host
+from openant_tools.comms.reboot import reboot
 from openant_tools.comms.scan import scan
 from openant_tools.comms.setup import open_bus
 from openant_tools.comms.silence import diagnose, explained
 from openant_tools.comms.troubles import PORT, SILENCE
 from openant_tools.procedure.journal import Journal
-from openant_tools.procedure.step import Bench, Intent
+from openant_tools.procedure.step import Answer, Bench, Declined, Event, Intent, drive
 from openant_tools.recording.run import Facts, Run
 from openant_tools.robot.folder import create_robot
 
@@ -232,6 +233,8 @@ def test_a_latched_error_is_named_cleared_and_leaves_torque_off(tmp_path: Path) 
         assert result.exit_code == 0, result.output
         assert "servo 31 has switched itself off after overload" in result.output
         assert "power it off and on" in result.output
+        assert "will reboot servo 31" in result.output
+        assert "torque_enable 0" in result.output
         assert talker.rebooted == [31]
         assert (talker.memory[31][64], talker.memory[31][70]) == (0, 0)
         again = run(*words, "--yes")
@@ -250,6 +253,27 @@ def test_no_reboot_while_the_cause_stands(tmp_path: Path, address: int, value: i
         assert result.exit_code == 1
         assert why in result.output
         assert not talker.rebooted
+
+
+class Silent:
+    """A face with nobody at it."""
+
+    def answer(self, event: Event) -> Answer:
+        return None
+
+
+def test_nothing_is_rebooted_that_is_not_granted(tmp_path: Path) -> None:
+    with talking(tmp_path, 31) as talker:
+        talker.memory[31][70], talker.memory[31][64] = 0x20, 1
+        bus = open_bus(talker.path, 1_000_000)
+        try:
+            procedure = reboot(bus, 31, "servo 31", "openant comms reboot")
+            with pytest.raises(Declined, match="not done: reboot servo 31"):
+                drive(procedure, Silent())
+        finally:
+            bus.close()
+        assert not talker.rebooted
+        assert not talker.written
 
 
 def test_an_error_that_comes_back_at_once_is_said(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ from plants import run_of
 from openant_tools.cli import main
 from openant_tools.cli import openant as table
 from openant_tools.recording.tables import write_table
+from openant_tools.robot.mjcf import nominal_model_path
 
 PAGES = ["README.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")))]
 #: what a fence may say of a block of commands beside its language
@@ -233,6 +234,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory, thorough: bool) -> Path:
     run("config export --robot my-ant --out ant12.json", folder)
     if thorough:
         run("sysid record --protocol stand --seconds 8 --robot my-ant --out one.mcap", folder)
+        shutil.copy(nominal_model_path("standard"), folder / "my-ant" / "calibrated.xml")
         run("sysid record --protocol stand --seconds 8 --seed 1 --robot my-ant --out floor-2.mcap", folder)
         for name in ("sac-1", "sac-2"):
             run(f"train sac --robot my-ant --steps 100 --out my-ant/runs/{name}", folder)  # the first point of a curve

@@ -562,7 +562,8 @@ def test_positions_are_what_a_late_encoder_says(tmp_path: Path, horizon: float |
 
 def test_encoders_that_are_late_by_different_times_are_refused(tmp_path: Path) -> None:
     text = nominal_model_path("standard").read_text()
-    assert (sensor := '<jointpos name="pos.hip_rr"') in text
+    sensor = '<jointpos name="pos.hip_rr"'
+    assert sensor in text
     model = plants.write(tmp_path / "one.xml", text.replace(sensor, f'{sensor} delay="0.03" nsample="40"'))
     run = walking(load_plant(nominal_model_path("standard")), 0.5)
     with pytest.raises(BadInput, match="not all of them the same"):

@@ -26,7 +26,7 @@ from openant_tools.comms.restart import MotionStopped
 from openant_tools.comms.setup import config_of_unknown_robot
 from openant_tools.errors import BadInput, HardwareFault, OpenAntError
 from openant_tools.procedure.finding import Finding, latest
-from openant_tools.procedure.step import Ask, Event, Progress
+from openant_tools.procedure.step import Answer, Ask, Event, Live, Progress, drive
 from openant_tools.procedure.unfinished import unfinished
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.resume import continuation
@@ -385,9 +385,7 @@ def test_a_soak_survives_kill_9_and_is_one_recording(tmp_path: Path) -> None:
     glitch = {"cause": "temperature_glitch", "where": "knee_rr", "fraction": 0.02}
     with robot(tmp_path / "ant", fault=[glitch], **DOZING) as there:
         steps = run_soak(plan, out, there)
-        first = next(steps)
-        while first.seconds < 40:
-            first = next(steps)
+        assert any(isinstance(event, Progress) and (event.share or 0) >= 40 / 120 for event in steps)
         [engine] = [one for one in EngineProcess.running if one.config.port == there.bench.bus]
         # Stepped time runs faster than the disk is synced, once a second.
         for _ in range(600):
@@ -437,6 +435,24 @@ def test_a_soak_ends_below_the_limit_that_the_servo_has(tmp_path: Path) -> None:
     assert made.joint == "hip_fl"
     assert made.loaded_s < 300
     assert "37 °C, 3 K below its limit" in made.words
+
+
+def test_enough_ends_the_cooling_and_not_the_load(tmp_path: Path) -> None:
+    class Impatient:
+        """Says "enough" whenever it may."""
+
+        def answer(self, event: Event) -> Answer:
+            return True if isinstance(event, Live) else None
+
+    with robot(tmp_path / "ant", **DOZING) as there:
+        plan = SoakPlan(load="hang", seconds=60.0, cool_down_s=600.0)
+        made = drive(run_soak(plan, tmp_path / "soak.mcap", there), Impatient())
+        assert not any(there.torque())
+    assert (made.why, made.loaded_s) == ("time", pytest.approx(60.0, abs=1.0))
+    recording = read_recording(tmp_path / "soak.mcap")
+    assert 65.0 < recording.run.duration_s < 90.0
+    assert recording.events == ()
+    assert recording.damage is None
 
 
 def test_the_engine_stops_a_hot_robot_that_nobody_watches(tmp_path: Path) -> None:
@@ -609,9 +625,10 @@ def test_fit_forecast_and_compare_from_tables(tmp_path: Path, stress: Run) -> No
     assert not kept.ok
     code, out = command(
         "thermal", "forecast", tmp_path / "bare.parquet", "--at", 10, "--json", tmp_path / "told.json", "--derate",
-        "--robot", tmp_path / "ant", "--after", tmp_path / "fit.json",
+        "--robot", tmp_path / "ant", "--after", tmp_path / "fit.json", "--report", tmp_path / "ahead",
     )  # fmt: skip
     assert code == 1
+    assert (tmp_path / "ahead" / "report.html").is_file()
     assert "reaches 72 °C after" in out
     assert "advice: work" in out
     assert "walk with rests" in out
@@ -623,11 +640,18 @@ def test_fit_forecast_and_compare_from_tables(tmp_path: Path, stress: Run) -> No
     assert rules is not None
     assert 0 < rules.joints["knee_fl"].least < 1
     assert command("config", "check", "--robot", tmp_path / "ant")[0] == 0
-    code, out = command("thermal", "compare", tmp_path / "bare", tmp_path / "cool", "--json", tmp_path / "diff.json")
+    written_to = ("--json", tmp_path / "diff.json", "--report", tmp_path / "diff")
+    code, out = command("thermal", "compare", tmp_path / "bare", tmp_path / "cool", *written_to)
     assert code == 0
     assert "knee_fl" in out
     assert " *" in out
-    assert command("thermal", "compare", tmp_path / "bare", "--paper")[1].startswith("Paper: a Lite's knee")
+    assert (tmp_path / "diff" / "report.html").is_file()
+    written_to = ("--json", tmp_path / "paper.json", "--report", tmp_path / "paper")
+    code, out = command("thermal", "compare", tmp_path / "bare", "--paper", *written_to)
+    assert code == 0
+    assert out.startswith("Paper: a Lite's knee")
+    assert json.loads((tmp_path / "paper.json").read_text())["paper"] == out.splitlines()[0]
+    assert out.splitlines()[0] in (tmp_path / "paper" / "report.md").read_text()
 
 
 def test_a_trained_policy_is_a_load(tmp_path: Path) -> None:
