@@ -17,6 +17,7 @@ from openant_tools.gap.diagnosis import UNEXPLAINED, Diagnosis, Found, Span
 from openant_tools.gap.measure import measure
 from openant_tools.gap.next import suggestion
 from openant_tools.gap.residual import residual_after
+from openant_tools.gap.size_interval import Known, ends
 from openant_tools.gap.trials import Trials
 from openant_tools.gap.velocity_delay import velocity_delay
 from openant_tools.numbers import number, percent
@@ -168,13 +169,14 @@ def _found(trials: Trials, row: Row, best: Closure | None, probability: float) -
     def stated(point: Mapping[str, float]) -> dict[str, float]:
         return effect.stated(effect.values(dict(point), protocol.reference, where), protocol.reference, where)
 
-    centre, ends = stated(x), []
+    centre, points = stated(x), []
     for q in effect.quantities:
-        for sign in (-TWO_SIDED_95, TWO_SIDED_95):
-            moved = x[q.name] + sign * std[q.name]
-            ends.append({**x, q.name: moved if q.signed else max(moved, 1e-6)})
+        support = None if effect.random else row.support or 0.0
+        count = len(protocol.joints if effect.of_body else at)
+        know = Known.of(q, x, effect.quantities, std[q.name], q.allowed(protocol.reference, where), support, count)
+        points += [{**x, q.name: end} for end in ends(q, know)]
     with np.errstate(over="ignore"):  # of what no run says, an end may be infinite
-        known = [stated(end) for end in ends]
+        known = [stated(point) for point in points]
     spans = {
         key: Span(value, min(value, *(end.get(key, value) for end in known)), max(value, *(end.get(key, value) for end in known)))
         for key, value in centre.items()
