@@ -225,6 +225,7 @@ def _rows(cases: Sequence[Case]) -> list[Row]:
         return Row(words, len(of), sum(map(true, of)), None, first, then, **more)
 
     closed = sorted(value for case in large if case.right for value in _closed(case))
+    sizes = [within for case in cases for within in _sizes(case)]
     times = [case.seconds for case in cases if math.isfinite(case.seconds)]
     return [
         share("right name first, medium and large, joint, servo, bus", joint, lambda c: c.right, 0.90, 0.98),
@@ -236,6 +237,7 @@ def _rows(cases: Sequence[Case]) -> list[Row]:
         share("outside the catalogue: not given a name", outside, lambda c: not c.named, 0.75, 0.85),
         share("right answers kept (not called unexplained)", ranked, lambda c: c.verdict != "unexplained", 0.92, 0.95),
         Row("excess gap closed on held-out runs, median, right name given", len(closed), None, _median(closed), 0.85, 0.95),
+        Row("sizes of causes rightly named within their 95 % interval", len(sizes), sum(sizes), None, 0.90, 0.95),
         share("both of two effects found", two, lambda c: set(c.true) <= set(c.said.get("selected", [])), 0.65, 0.85),
         Row("time of one robot, its recordings never seen, median", len(times), None, _median(sorted(times)), 120, 60, True, "s"),
     ]  # fmt: skip
@@ -246,6 +248,18 @@ def _median(values: Sequence[float]) -> float | None:
         return None
     n = len(values)
     return (values[(n - 1) // 2] + values[n // 2]) / 2
+
+
+def _sizes(case: Case) -> list[bool]:
+    """Of each size of an effect that is there and was named, whether it lies where it is said to."""
+    said = {one["effect"]: one.get("parameters", {}) for one in case.said["effects"]}
+    return [
+        span["low"] <= true <= (math.inf if span["high"] is None else span["high"])
+        for effect in case.answer.effects
+        if effect.effect in case.said.get("selected", [])
+        for name, true in effect.parameters.items()
+        if isinstance(true, int | float) and (span := said.get(effect.effect, {}).get(name)) and span["low"] is not None
+    ]
 
 
 def _joints(case: Case) -> tuple[str, ...]:

@@ -86,7 +86,9 @@ def sealed_set(made: tuple[Path, Path, bytes], tmp_path: Path) -> tuple[Path, Pa
 def says(robot: Path, model: Path) -> dict[str, Any]:
     """A judge that finds whatever robot 1 has."""
     name = "action_delay" if robot.name == "robot-001" else "none"
+    size = {"delay_s": {"value": 0.02, "low": 0.0, "high": 1.0}, "other_s": {"value": 0.0, "low": None, "high": None}}
     found = {"effect": "action_delay", "joints": ["knee_fl"], "probability": 0.9 if name != "none" else 0.05}
+    found["parameters"] = size
     return {
         "verdict": name, "effects": [found], "selected": [name] if name != "none" else [],
         "gap": {"before": 0.02, "after": 0.002, "floor": 0.001}, "ambiguous_with": [],
@@ -301,6 +303,8 @@ def test_the_score_counts_what_is_right_and_shows_what_is_not(
     rows = {row["what"]: row for row in json.loads(out.read_text())["rows"]}
     assert rows["right name first, medium and large, joint, servo, bus"]["k"] == 1
     assert rows["outside the catalogue: not given a name"]["k"] == 1
+    sizes = rows["sizes of causes rightly named within their 95 % interval"]
+    assert (sizes["k"], sizes["n"]) == (1, 1)
     assert rows["excess gap closed on held-out runs, median, right name given"]["value"] == pytest.approx(
         0.913, abs=1e-3
     )
