@@ -18,15 +18,23 @@ from talker import READER, Talker, talking
 from wire import IDS, ant
 
 from openant_tools.comms.bus import Bus
-from openant_tools.comms.reboot import latched, reboot
+from openant_tools.comms.reboot import reboot
 from openant_tools.comms.scan import scan
 from openant_tools.comms.setup import open_bus
 from openant_tools.comms.silence import diagnose
+from openant_tools.procedure.step import Answer, Event, drive
 
 __all__ = ["campaigns"]
 
 ANT = tuple(IDS)
 MEGABAUD = 1_000_000
+
+
+class Granting:
+    """Who grants everything."""
+
+    def answer(self, event: Event) -> Answer:
+        return True
 
 
 @contextlib.contextmanager
@@ -97,8 +105,8 @@ def _latched(k: int) -> bool:
     bit = (0x01, 0x04, 0x08, 0x10, 0x20)[k % 5]
     with _bus(10, 31) as (bus, talker):
         talker.memory[31][70], talker.memory[31][64] = bit, 1
-        standing = latched(bus, 31)
-        return len(standing.errors) == 1 and not reboot(bus, 31) and talker.memory[31][64] == 0
+        found = drive(reboot(bus, 31, "knee_fl", "openant comms reboot"), Granting())
+        return bool(found.ok) and talker.memory[31][64] == 0
 
 
 def _stopped(k: int) -> bool:
