@@ -14,7 +14,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -54,6 +54,11 @@ __all__ = ["Engine", "main", "run"]
 
 #: s for which the parent may take its time to hear the last words
 LAST_WORDS_S = 0.5
+#: what to do where the port has gone: the watchdog stops servos, it does not let them go
+PORT_GONE = (
+    "the servos' watchdog stops them, and they hold where they are: plug the USB cable in again at once, which switches torque off, "
+    "or cut their power before you touch them"
+)
 #: s for which the recording's thread may keep the interpreter from a cycle that is due; Python's own 5 ms are half a cycle
 SWITCH_S = 2e-4
 #: s between two notes of what a virtual robot takes of this computer
@@ -171,8 +176,7 @@ class Engine:
                 self._cycle(wake, cycles)
             except PortGone as error:
                 self._port.lose()
-                remedy = "look at the USB cable; the servos' watchdog stops them"
-                self._stopped(Trip(str(error.what), remedy, cause=StopCause.PORT))
+                self._stopped(Trip(str(error.what), PORT_GONE, cause=StopCause.PORT))
             except HardwareFault as fault:
                 # A servo that had to answer did not, or refused: what its motion waits for will not come.
                 why = self._asked_why(fault)
@@ -208,7 +212,7 @@ class Engine:
         if self._torque and not self._clock.stepped and now - before > port.patience_s:
             self._stopped(
                 Trip(
-                    f"this computer stood still for {numbers.number(now - before, 's', decimals=1)}, and torque was switched off meanwhile",
+                    f"this computer stood still for {numbers.number(now - before, 's', decimals=1)}: torque is off now",
                     "close what else keeps it busy, or let it not go to sleep",
                     cause=StopCause.STALL,
                 )
@@ -371,14 +375,15 @@ class Engine:
 
     # ---- stops ---------------------------------------------------------------------------------------------------
 
-    def _torque_off(self) -> None:
+    def _torque_off(self) -> list[str]:
+        """Joints that do not confirm it."""
         self._torque = False
         self._limp.end()
         self._queue.clear()
-        self._hardware.torque_off()
+        return self._hardware.torque_off()
 
     def _stopped(self, trip: Trip, where: str | None = None) -> None:
-        """Release everyone, tell, and only then make sure: on a bad line that may take a while.
+        """Release everyone, make sure, which on a bad line may take a while, and tell what is known then.
 
         Args:
             where: what it concerns, where that is not the bus.
@@ -386,13 +391,16 @@ class Engine:
         if not self._port.lost:
             with contextlib.suppress(HardwareFault):
                 self._servos.torque_off_now()
+        given_up = self._queue.give_up()
+        if left := self._torque_off():
+            holding = f"{', '.join(left)} may still hold: cut the power before you touch the robot"
+            trip = replace(trip, remedy=f"{trip.remedy}; {holding}" if trip.remedy else holding)
         with contextlib.suppress(RecordingStopped):  # told by the next cycle's row
             self._recorder.event("stopped", what=trip.what, joint=trip.joint, cause=trip.cause.value)
         self._trip = trip
         self._parent.say(messages.Stopped(trip.what, trip.remedy, trip.joint, trip.cause))
-        for number in self._queue.give_up():
+        for number in given_up:
             self._parent.say(messages.Reply(number, error=(trip.what, where, trip.remedy), cause=trip.cause))
-        self._torque_off()
 
     def _asked_why(self, fault: HardwareFault) -> HardwareFault:
         """A servo's silence with its cause: the servos are asked, once torque is off."""
@@ -414,6 +422,7 @@ class Engine:
         try:
             if self._port.reopen():
                 report_leftovers(self._servos, self._parent.notice)
+                self._port.holding = False
                 self._parent.notice("the port is back")
         except HardwareFault:
             self._port.lost = True

@@ -44,6 +44,8 @@ class EnginePort:
     def __init__(self, config: EngineConfig, notice: Callable[[str], None]) -> None:
         self._config, self._notice = config, notice
         self.lost = False
+        #: it went while torque was on, and nobody has switched that off since
+        self.holding = False
         self._reopen_at = 0.0
         self.alive_at = -float("inf")
         self.asked_at = 0.0

@@ -25,6 +25,7 @@ from openant_tools.comms.messages import Command, EngineConfig, Event, Finished,
 from openant_tools.comms.restart import MotionStopped
 from openant_tools.comms.ring import Ring, columns
 from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.numbers import exact
 from openant_tools.robot.folder import RobotFolder
 
 __all__ = ["EngineProcess"]
@@ -33,6 +34,9 @@ __all__ = ["EngineProcess"]
 CONNECT_TIMEOUT_S = 60.0
 #: The engine sends torque off, closes the recording and goes.
 CLOSE_TIMEOUT_S = 15.0
+#: s of one look for an answer; so many of them without a new row of telemetry, and nobody is there: asking why a servo is silent takes
+#: seconds
+LOOK_S, SILENT_LOOKS = 0.1, 150
 
 
 class EngineProcess:
@@ -164,14 +168,22 @@ class EngineProcess:
     def wait(self, number: int, timeout_s: float | None = None) -> Any:
         """The answer to a command that was sent with `start`; as `ask`."""
         give_up = None if timeout_s is None else time.monotonic() + timeout_s
+        rows, looks = self._ring.count, 0
         while number not in self._replies:
+            # Looks, not seconds: those in which this process stood still itself do not count.
+            rows, looks = (rows, looks + 1) if rows == self._ring.count else (self._ring.count, 0)
+            if looks > SILENT_LOOKS and number and not self.description["stepped"]:
+                raise HardwareFault(
+                    f"the engine does not answer and reads nothing for {exact(SILENT_LOOKS * LOOK_S, 's')}", where=self.config.port,
+                    remedy="its guardian has switched torque off; this computer is overloaded, or something has stopped that process",
+                )  # fmt: skip
             if give_up is not None and time.monotonic() > give_up:
                 raise HardwareFault(
                     "the engine does not answer", where=self.config.port, remedy="stop it and try again"
                 )
             if self._ended:
                 self._died()
-            self._receive(0.1)
+            self._receive(LOOK_S)
         return self._value(self._replies.pop(number))
 
     def _value(self, reply: Reply) -> Any:

@@ -42,13 +42,20 @@ WATCHDOG_FIRMWARE = 38
 UNASKED_FIRMWARE, UNASKED = 45, {"drive_mode": 8, "startup_configuration": 1}
 #: How long torque off is sent again where servos do not confirm it.
 RELEASE_S = 0.5
+#: How long a program that ends waits for a port that went while torque was on, and how often it looks.
+PLUGGED_IN_S, LOOK_S = 3.0, 0.05
 
 
-def torque_off(port: EnginePort, servos: Servos, notice: Callable[[str], None]) -> None:
-    """Release every servo, again and again until each has confirmed or time is up: the line may be bad."""
+def torque_off(port: EnginePort, servos: Servos, notice: Callable[[str], None]) -> list[str]:
+    """Release every servo, again and again until each has confirmed or time is up: the line may be bad.
+
+    Returns:
+        Joints that do not confirm it.
+    """
+    port.holding |= port.lost and port.bus.guarded
     port.bus.guarded = False
     if port.lost:
-        return
+        return []
     left, give_up = list(servos.joints), port.clock.now() + RELEASE_S
     try:
         while left:
@@ -58,10 +65,14 @@ def torque_off(port: EnginePort, servos: Servos, notice: Callable[[str], None]) 
                 break
     except PortGone:
         port.lose()
-    if left and not port.lost:
+        port.holding = True
+    if port.lost:
+        return []
+    if left:
         notice(
             f"torque off was sent to {', '.join(left)}, but they do not confirm: the servos' own watchdog stops them"
         )
+    return left
 
 
 def report_leftovers(servos: Servos, notice: Callable[[str], None]) -> None:
@@ -75,7 +86,7 @@ def report_leftovers(servos: Servos, notice: Callable[[str], None]) -> None:
         servos.write_counts("bus_watchdog", joint, 0)
     if tripped:
         notice(
-            f"the Bus Watchdog of {', '.join(tripped)} had tripped, since the last program ended without a word, "
+            f"the Bus Watchdog of {', '.join(tripped)} had tripped, since nothing reached them for a while, "
             "and had locked the goals: cleared"
         )
     for joint, status in servos.read_all("hardware_error_status").items():
@@ -181,8 +192,9 @@ class Hardware:
         port.bus.guarded = True
         port.beat()
 
-    def torque_off(self) -> None:
-        torque_off(self.port, self.servos, self._notice)
+    def torque_off(self) -> list[str]:
+        """Joints that do not confirm it."""
+        return torque_off(self.port, self.servos, self._notice)
 
 
 # ---- taking over ---------------------------------------------------------------------------------------------------
@@ -260,8 +272,18 @@ def _note_write(journal: str | None, change: EepromWrite) -> None:
 
 
 def _release(port: EnginePort, servos: Servos, notice: Callable[[str], None]) -> None:
-    """The end of it all: where it fails the guardian, who is not sent home then, tries once more as this process ends."""
+    """The end of it all: where it fails the guardian, who is not sent home then, tries once more as this process ends.
+
+    Where the port went with torque on it is waited for: servos whose watchdog has stopped them hold until they are told.
+    """
     try:
+        give_up = port.clock.now() + PLUGGED_IN_S
+        while port.lost and port.holding and not port.clock.stepped and port.clock.now() < give_up:
+            with contextlib.suppress(HardwareFault):
+                if port.reopen():
+                    report_leftovers(servos, notice)
+                    break
+                port.clock.sleep_until(port.clock.now() + LOOK_S)
         torque_off(port, servos, notice)
     except HardwareFault as error:
         port.guardian.forsake()

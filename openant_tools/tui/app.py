@@ -188,7 +188,7 @@ class OpenAnt(App[int]):
             self.focused.insert_text_at_cursor(" ")
             if not told:
                 return
-        words = "STOP: torque is switched off" if told else "STOP: no torque was on"
+        words = "STOP: torque is switched off" if told else "STOP: this program holds no robot"
         self.notify(words, severity="error" if told else "information", timeout=4)
 
     def action_interrupt(self) -> None:

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -22,7 +23,7 @@ import numpy as np
 import pytest
 
 from openant_tools.cli.virtual_for_command import virtual_robot
-from openant_tools.comms import messages
+from openant_tools.comms import engine_process, messages
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.guards import Guards
@@ -399,6 +400,60 @@ def test_unplugging_stops_the_motion_and_plugging_in_goes_on_from_there(live: di
     assert recording.damage is None
     ends = [(event["kind"], event["cause"]) for event in recording.events if event["kind"] in ("stopped", "restart")]
     assert ends == [("stopped", "port"), ("restart", None)]
+
+
+@again_where_late
+def test_plugging_in_while_the_program_ends_switches_torque_off(live: dict[str, str]) -> None:
+    """What the watchdog has stopped holds on; who gives up at a port that is gone still waits a moment for it."""
+    control = VirtualControl(live["control"])
+    back = threading.Timer(1.0, lambda: control.ask("fault", cause="usb_unplug", device="bus", on=False))
+    try:
+        with connected(live) as engine:
+            engine.ask(messages.Torque(True))
+            moving = engine.start(messages.Play(np.repeat(HOME[None, :], 3000, axis=0)))
+            time.sleep(0.3)
+            control.ask("fault", cause="usb_unplug", device="bus", on=True)
+            with pytest.raises(HardwareFault, match="they hold where they are: plug the USB cable in again at once"):
+                wait_until(lambda: engine.done(moving))
+            back.start()
+        assert not any(torques(live))
+    finally:
+        back.join()
+        control.close()
+
+
+@again_where_late
+def test_a_servo_that_does_not_hear_that_it_is_to_let_go_is_named(live: dict[str, str]) -> None:
+    """Its data wire is broken, its power is not: it holds on."""
+    control = VirtualControl(live["control"])
+    with connected(live) as engine:
+        engine.ask(messages.Torque(True))
+        moving = engine.start(messages.Play(np.repeat(HOME[None, :], 3000, axis=0)))
+        control.ask("fault", cause="broken_wire", where=["hip_fl", "knee_fl"], on=True)
+        try:
+            with pytest.raises(HardwareFault, match=r"knee_fl.* may still hold: cut the power before you touch the robot"):
+                wait_until(lambda: engine.done(moving))
+            assert torques(live)[JOINT_NAMES.index("knee_fl")]
+        finally:
+            control.ask("fault", cause="broken_wire", where=["hip_fl", "knee_fl"], on=False)
+            control.close()
+    wait_until(lambda: answers(live))
+
+
+def test_an_engine_that_stands_still_is_not_waited_for_for_ever(
+    live: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine_process, "SILENT_LOOKS", 10)
+    with connected(live) as engine:
+        engine.ask(messages.Torque(True))
+        moving = engine.start(messages.Hold(60.0))
+        os.kill(engine.pid, signal.SIGSTOP)
+        try:
+            with pytest.raises(HardwareFault, match="the engine does not answer and reads nothing for 1 s"):
+                engine.wait(moving)
+            wait_until(lambda: not any(torques(live)))  # its guardian has switched it off
+        finally:
+            os.kill(engine.pid, signal.SIGCONT)
 
 
 # ---- dying with torque on ----------------------------------------------------------------------------------------
