@@ -59,19 +59,20 @@ def test_every_step_with_parts_notes_them(step: Step) -> None:
 
 
 def test_a_watch_over_the_bus_goes_on_with_its_next_minute(tmp_path: Path) -> None:
-    soak = tmp_path / "ant" / "recordings" / "comms-soak.mcap"
     with robot(tmp_path / "ant") as there:
         note = left(
             there, comms_step, "comms", lambda event: isinstance(event, Progress) and (event.share or 0) > 0.68 and "lost" in event.words,
             **{"how long": 1.5},
         )  # fmt: skip
         assert (note.words, note.next) == ("1 of 2", "minute 2")
+        (soak,) = there.folder.recordings.iterdir()
         before = soaked_seconds(soak)
         finding, builder = there.do(comms_step(there.bench))
     assert finding.ok, finding
     assert not asked(builder)
     assert "swing all legs gently on the stand until it was 1.5 min in all" in builder.said
     assert 55 < before < 75
+    assert list(there.folder.recordings.iterdir()) == [soak]
     assert soaked_seconds(soak) == pytest.approx(90, abs=3)
     assert unfinished(there.folder, "comms") is None
 

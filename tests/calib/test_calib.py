@@ -865,7 +865,7 @@ def test_the_arena_is_measured_by_the_robot_itself_which_moves_once_however_ofte
             in finding.problems[1]
         )
         assert ant.folder.config().imu.gyro_counts_per_dps == pytest.approx(1000 / 70, abs=1e-4)
-        recorded = read_recording(ant.folder.recordings / "arena.mcap")
+        recorded = read_recording(ant.folder.path / finding.data["recordings"])
         assert recorded.run.facts.extra["imu"]["gyro_counts_per_dps"] == pytest.approx(16.384)
 
 
