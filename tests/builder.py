@@ -130,6 +130,10 @@ class Robot:
         finally:
             builder.hands.close()
 
+    def recorded(self) -> dict[str, bytes]:
+        """Every recording of its folder: name → what it holds."""
+        return {path.name: path.read_bytes() for path in self.folder.recordings.iterdir()}
+
     def torque(self) -> list[bool]:
         """Whether each servo of the real robot behind the wire has torque."""
         return [bool(servo.torque) for servo in self.server.world.servos]

@@ -116,17 +116,19 @@ def check(bench: Bench) -> Procedure:
         if difference.by == BY_FACTORY:
             yield Say(str(difference), "warn")
     outside: dict[str, float] = {}
+    runs = list[Run]()
     yield Progress(0.05, "IMU")
     problems += _imu(bench, config, evidence)
     yield Intent("sweep every joint slowly through its range, then twitch for 20 s, on the stand", moves=True)
     now: dict[str, JointSweep] = {}
     try:
         run = yield from sweep(
-            engine_config(bench, imu=None), bench.folder.recordings / "check-sweep.mcap", "slow sweep", (0.1, 0.6)
+            engine_config(bench, imu=None), bench.folder.new_recording("check-sweep"), "slow sweep", (0.1, 0.6)
         )
     except HardwareFault as fault:
         problems.append(str(fault))
         return _finding(problems, evidence, {})
+    runs.append(run)
     limits = {motor.joint: (motor.min_rad, motor.max_rad) for motor in config.motors.values()}
     now = analyse(run, limits)
     problems += changed(baseline, now)
@@ -142,6 +144,7 @@ def check(bench: Bench) -> Procedure:
     except HardwareFault as fault:
         problems.append(str(fault))
     else:
+        runs.append(twitch)
         problems += loose(_lost(twitch), config.bus.chain, problems)
         problems += yield from _of_this_computer(twitch)
         named = {*(line.partition(":")[0] for line in problems), *(difference.joint for difference in odd)}
@@ -157,7 +160,11 @@ def check(bench: Bench) -> Procedure:
     return _finding(
         problems,
         evidence,
-        {"sweep": {joint: one.as_dict() for joint, one in now.items()}, "outside": outside},
+        {
+            "sweep": {joint: one.as_dict() for joint, one in now.items()},
+            "outside": outside,
+            "recordings": ", ".join(bench.folder.relative(run.path) for run in runs if run.path),
+        },
         unsure,
     )
 
@@ -408,7 +415,7 @@ def _imu(bench: Bench, config: RobotConfig, evidence: list[Evidence]) -> list[st
 
 def _twitch(bench: Bench) -> Subroutine[Run]:
     """A short excitation on the stand, recorded; the recording."""
-    path = bench.folder.recordings / "check-twitch.mcap"
+    path = bench.folder.new_recording("check-twitch")
     played = protocol("stand", TWITCH_S)
     config = engine_config(bench)
     joints = tuple(servo.joint for servo in config.servos)
@@ -426,7 +433,7 @@ def _twitch(bench: Bench) -> Subroutine[Run]:
             protocol="twitch",
             supply_v=round(float(np.mean(list(volts.values()))) * 0.1, 2),
         )
-        engine.ask(messages.Record(str(path), facts, overwrite=True))
+        engine.ask(messages.Record(str(path), facts))
         motion = messages.Play(commands, "twitch", limp if limp.any() else None)
         yield from play_watched(engine, motion, len(commands) / config.rate_hz, "twitch", (0.6, 1.0))
         engine.ask(messages.StopRecording())

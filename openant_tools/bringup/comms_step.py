@@ -14,7 +14,7 @@ from openant_tools.procedure.by_time import minutes, noted
 from openant_tools.procedure.finding import together
 from openant_tools.procedure.relay import relayed, within
 from openant_tools.procedure.step import Ask, Bench, Intent, Procedure, Say
-from openant_tools.procedure.unfinished import Parts, unfinished
+from openant_tools.procedure.unfinished import Parts, forget, unfinished
 from openant_tools.recording.tables import read_run
 
 __all__ = ["comms_step"]
@@ -33,11 +33,11 @@ def comms_step(bench: Bench) -> Procedure:
         HardwareFault: not all servos answer.
     """
     still = yield from within((0.0, AT_REST), comms_health(bench))
-    path = bench.folder.recordings / "comms-soak.mcap"
     left = unfinished(bench.folder, "comms")
-    length = None if left is None or not path.is_file() else next(iter(left.done.values())).get("minutes")
+    path = None if left is None else left.recording(bench.folder)
+    length = None if left is None or path is None else next(iter(left.done.values())).get("minutes")
     resume = length is not None
-    if length is None:
+    if path is None or length is None:
         asked = yield Ask(
             "Now watch the bus while the legs swing. For how long? (0: not at all; an hour finds what is rare)",
             unit="min", default=DEFAULT_MIN, low=0.0, high=LONGEST_MIN,
@@ -45,9 +45,10 @@ def comms_step(bench: Bench) -> Procedure:
         length = float(asked) if isinstance(asked, int | float) else DEFAULT_MIN
         if length == 0.0:
             return still
-        path.unlink(missing_ok=True)
+        forget(bench.folder, "comms")  # nothing of it is there any more
+        path = bench.folder.new_recording("comms-soak")
     parts = Parts(bench.folder, "comms", minutes(60 * length))
-    if parts.before:
+    if resume:
         yield Say(parts.words)
     yield Intent(
         f"swing all legs gently on the stand until it was {exact(length)} min in all, and keep what the bus loses"
@@ -57,7 +58,9 @@ def comms_step(bench: Bench) -> Procedure:
     )
     config, text = engine_config(bench), bench.folder.config_file.read_text(encoding="utf-8")
     soaking = soak(config, path, 60 * length, resume=resume, robot_toml=text)
-    soaked = yield from within((AT_REST, 1.0), noted(soaking, parts, minutes=length))
+    soaked = yield from within(
+        (AT_REST, 1.0), noted(soaking, parts, minutes=length, recording=bench.folder.relative(path))
+    )
     told = yield from relayed(lambda progress, notice: diagnose_dropouts([read_run(path, need=())]))
     moving = dropouts_finding(told, [bench.folder.relative(path)], COMMAND)
     if soaked.whole:

@@ -49,13 +49,14 @@ def identification(bench: Bench) -> Procedure:
     judge = takes(out.with_name(f"identify-{stamp}-held-out.mcap"), played, 1, repeats=2)
     named = {take.path: name for name, take in zip(TAKES, [*wanted, *judge], strict=False)}
     missing = [take for take in [*wanted, *judge] if named[take.path] not in before or not take.path.is_file()]
-    for take in missing:
-        take.path.unlink(missing_ok=True)  # cut short
     if missing:
         much = f"{len(missing)} × {number(RECORD_S, 's', decimals=0)}"
         yield Intent(
             f"move all joints on the stand, legs free, {much}, then adjust the simulation to the recordings", moves=True
         )
+        for take in missing:
+            if take.path.is_file():  # cut short
+                take.path.rename(bench.folder.new_recording(f"{take.path.stem}-cut-short"))
         recording = record_takes(
             engine_config(bench, imu=None),
             missing,

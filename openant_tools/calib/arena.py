@@ -168,14 +168,16 @@ def arena(bench: Bench) -> Procedure:
     elif parts.before:
         yield Say(parts.words)
     seen = parts.before.get(MOTION, {})
-    if seen.get("where") == where and _path(bench).is_file():
-        view, record = _View.of_note(seen), read_recording(_path(bench))
+    path = bench.folder.path / str(seen.get("recording", ""))
+    if seen.get("where") == where and path.is_file():
+        view, record = _View.of_note(seen), read_recording(path)
     else:
         yield Progress(0.0, f"looking through {where}")
         view = yield from _view(bench, config, where, parts)
         setup = replace(config.camera, body_tag_id=view.body_id, latency_s=None)
-        record = yield from _stand_and_wiggle(bench, config, setup, where, view.lens)
-        parts.done(MOTION, where=where, **asdict(view))
+        path = bench.folder.new_recording("arena")
+        record = yield from _stand_and_wiggle(bench, config, setup, where, view.lens, path)
+        parts.done(MOTION, where=where, recording=bench.folder.relative(path), **asdict(view))
     lens, camera_m, origin_id = view.lens, view.camera_m, config.camera.origin_tag_id
     setup = replace(config.camera, body_tag_id=view.body_id)
     problems += view.problems
@@ -273,7 +275,8 @@ def arena(bench: Bench) -> Procedure:
     yield Hands("Put it back on its stand.", "place", setup="stand")
     rest(bench)
     parts.end()
-    bench.folder.update(values, provenance=Provenance.measured(COMMAND, bench.folder.relative(_path(bench))))
+    recording = bench.folder.relative(path)
+    bench.folder.update(values, provenance=Provenance.measured(COMMAND, recording))
     ok = False if wrong else None if unsure else True
     return Finding(
         "arena",
@@ -289,6 +292,7 @@ def arena(bench: Bench) -> Procedure:
             "camera": str(where),
             "sizes": vars(sizes),
             "latency_s": latency_s,
+            "recordings": recording,
         },
         problems=(*wrong, *problems),
         unsure=tuple(unsure),
@@ -443,19 +447,14 @@ def _board_views(camera: Camera, clock: Clock, board: CharucoBoard) -> Subroutin
     return pictures
 
 
-def _path(bench: Bench) -> Path:
-    return bench.folder.recordings / "arena.mcap"
-
-
 def _stand_and_wiggle(
-    bench: Bench, config: RobotConfig, setup: CameraFacts, where: str | int, lens: Intrinsics
+    bench: Bench, config: RobotConfig, setup: CameraFacts, where: str | int, lens: Intrinsics, path: Path
 ) -> Subroutine[Recording]:
-    """Lie, stand, turn to and fro, lie: one recording, its phases in the facts."""
+    """Lie, stand, turn to and fro, lie: one recording, at `path`, its phases in the facts."""
     seen = camera_of_robot(replace(config, camera=setup), where)
     assert seen is not None
     # How high the body seems to be is what tells a wrong size here.
     camera: CameraConfig = replace(seen, intrinsics=lens, tags=replace(seen.tags, heights=(-math.inf, math.inf)))
-    path = _path(bench)
     with EngineProcess(engine_config(bench, camera=camera)) as engine:
         names = tuple(servo.joint for servo in engine.config.servos)
         rate = engine.config.rate_hz
@@ -475,7 +474,7 @@ def _stand_and_wiggle(
         phases = {"lying": [0.2, marks[1]], "standing": [marks[2] + 0.5, marks[3]], "wiggle": [marks[3], marks[4]]}
         engine.ask(messages.Torque(True))
         facts = Facts(joints=names, setup="floor", protocol="arena", extra={"phases": phases})
-        engine.ask(messages.Record(str(path), facts, overwrite=True))
+        engine.ask(messages.Record(str(path), facts))
         yield from play_watched(engine, messages.Play(played, "arena"), len(played) / rate, MOTION, (LOOKED, MOVED))
         engine.ask(messages.StopRecording())
         engine.ask(messages.Torque(False))

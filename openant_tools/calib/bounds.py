@@ -56,7 +56,7 @@ SWEEP, STAND, FLOOR, BACK = "slow sweep", "motions on the stand", "motions on th
 #: of the step's progress: ranges by hand up to there, then from where to where each recording is
 BY_HAND = 0.5
 SHARES = {SWEEP: (0.5, 0.6), STAND: (0.6, 0.85), FLOOR: (0.85, 1.0)}
-RECORDED = {SWEEP: "sweep.mcap", STAND: "bounds-stand.mcap", FLOOR: "bounds-floor.mcap"}
+RECORDED = {SWEEP: "sweep", STAND: "bounds-stand", FLOOR: "bounds-floor"}
 QUANTILES = (0.001, 0.01, 0.99, 0.999)
 SIGNALS = ("pos", "vel")
 BODY = ("gyro.x", "gyro.y", "gyro.z", "acc.x", "acc.y", "acc.z")
@@ -163,8 +163,9 @@ def bounds(bench: Bench) -> Procedure:
         values |= {f"motors.{joint}.min_rad": low, f"motors.{joint}.max_rad": high}
     bench.folder.update(values, provenance=Provenance.measured(COMMAND))
     if swept is None:
-        swept = yield from sweep(engine_config(bench, imu=None), _path(bench, SWEEP), "slow sweep", SHARES[SWEEP])
-        parts.done(SWEEP, **facts)
+        path = bench.folder.new_recording(RECORDED[SWEEP])
+        swept = yield from sweep(engine_config(bench, imu=None), path, "slow sweep", SHARES[SWEEP])
+        _note(bench, parts, SWEEP, facts, swept)
     sweeps = analyse(swept, limits)
     most = {kind: _most_friction(sweeps, kind) for kind in ("hip", "knee")}
     for one in sweeps.values():
@@ -179,7 +180,7 @@ def bounds(bench: Bench) -> Procedure:
 
     if stood is None:
         stood = yield from _library(bench, STAND)
-        parts.done(STAND, **facts)
+        _note(bench, parts, STAND, facts, stood)
     runs = [stood]
     question = "Also on the floor? It needs a metre of room around the robot."
     if walked is not None:
@@ -189,14 +190,14 @@ def bounds(bench: Bench) -> Procedure:
         rest(bench)
         yield Intent("play two of the motions on the floor; the robot stands up, walks about and lies down", moves=True)
         runs.append((yield from _library(bench, FLOOR)))
-        parts.done(FLOOR, **facts)
+        _note(bench, parts, FLOOR, facts, runs[-1])
     if len(runs) > 1:
         yield Hands("Put it back on its stand.", "place", setup="stand")
         rest(bench)
     parts.end()
     # The sweep is the one motion that takes every joint to its ends: neighbouring legs would meet there in the others.
     found, quantiles = measured_bounds([*runs, swept])
-    recording = ", ".join(bench.folder.relative(run.path) for run in runs if run.path)
+    recording = ", ".join(bench.folder.relative(run.path) for run in [*runs, swept] if run.path)
     bench.folder.update(
         {f"observation.{name}": [round(low, 5), round(high, 5)] for name, (low, high) in found.items()},
         provenance={"observation": Provenance.measured(COMMAND, recording)},
@@ -230,14 +231,16 @@ def _limit(reached_rad: float, kit_rad: float) -> float:
     return kit_rad if reached_rad > kit_rad - KEEP_OFF_RAD else round(max(0.0, reached_rad - KEEP_OFF_RAD), 5)
 
 
-def _path(bench: Bench, part: str) -> Path:
-    return bench.folder.recordings / RECORDED[part]
+def _note(bench: Bench, parts: Parts, part: str, facts: Mapping[str, Any], run: Run) -> None:
+    """Note a part with its facts and its recording."""
+    parts.done(part, **facts, recording=bench.folder.relative(run.path or ""))
 
 
 def _recorded(bench: Bench, parts: Parts, part: str, facts: Mapping[str, Any]) -> Run | None:
     """What was recorded before the step was left, where these are its facts; None where it is to be recorded."""
-    path = _path(bench, part)
-    return read_run(path) if parts.before.get(part) == facts and path.is_file() else None
+    note = parts.before.get(part, {})
+    path = bench.folder.path / str(note.get("recording", ""))
+    return read_run(path) if facts.items() <= note.items() and path.is_file() else None
 
 
 def _by_hand(bus: Bus, servos: Servos, joints: Sequence[str], parts: Parts) -> Subroutine[dict[str, Range]]:
@@ -356,7 +359,7 @@ def _sweep_words(sweeps: Mapping[str, JointSweep]) -> list[str]:
 def _library(bench: Bench, part: str) -> Subroutine[Run]:
     """Play the motions and record them in one file; the recording."""
     floor = part == FLOOR
-    path, setup = _path(bench, part), "floor" if floor else "stand"
+    path, setup = bench.folder.new_recording(RECORDED[part]), "floor" if floor else "stand"
     config = engine_config(bench)
     joints = tuple(servo.joint for servo in config.servos)
     with EngineProcess(config) as engine:
@@ -365,7 +368,7 @@ def _library(bench: Bench, part: str) -> Subroutine[Run]:
         names = ("wander", "trot") if floor else tuple(LIBRARY)
         start, end = SHARES[part]
         engine.ask(messages.Ramp(motion(names[0], joints, config.limits_rad, config.rate_hz, 0, floor=floor)[0]))
-        engine.ask(messages.Record(str(path), Facts(joints=joints, setup=setup, protocol="bounds"), overwrite=True))
+        engine.ask(messages.Record(str(path), Facts(joints=joints, setup=setup, protocol="bounds")))
         for seed, name in enumerate(names):
             played = motion(name, joints, config.limits_rad, config.rate_hz, seed, floor=floor)
             begun, done = (start + (end - start) * k / len(names) for k in (seed, seed + 1))

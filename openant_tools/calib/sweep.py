@@ -135,7 +135,7 @@ def sweep(config: EngineConfig, path: Path, words: str, part: Part = WHOLE) -> S
         facts = Facts(
             joints=joints, setup="stand", protocol="slow sweep", supply_v=float(np.mean(list(volts.values()))) * 0.1
         )
-        engine.ask(messages.Record(str(path), facts, overwrite=True))
+        engine.ask(messages.Record(str(path), facts))
         yield from play_watched(engine, messages.Play(played, "slow sweep"), len(played) / config.rate_hz, words, part)
         engine.ask(messages.StopRecording())
         engine.ask(messages.Torque(False))

@@ -77,7 +77,7 @@ def soak(
     from openant_tools.errors import BadInput
     from openant_tools.files import json_text, write_text
     from openant_tools.procedure.step import drive
-    from openant_tools.recording.writer import recording_path
+    from openant_tools.recording.writer import must_be_new, recording_path
 
     if transactions:
         if virtual_source is None:
@@ -86,8 +86,8 @@ def soak(
         _transactions(virtual_source, out, minutes * 60, rate_hz if given else TRANSACTIONS_HZ, still)
         return
     path, seconds = recording_path(out), minutes * 60
-    if path.exists() and not resume:
-        raise BadInput("there is a soak already", where=path, remedy="go on with it by --resume, or name another file")
+    if not resume:
+        must_be_new(path, "go on with it by --resume, or name another file")
     if resume and not path.exists():
         raise BadInput("there is no soak to go on with", where=path, remedy="leave out --resume")
     console = Console(stderr=True)

@@ -118,7 +118,7 @@ def record(
     from rich.console import Console
 
     from openant_tools.errors import BadInput
-    from openant_tools.recording.writer import recording_path
+    from openant_tools.recording.writer import must_be_new, recording_path
     from openant_tools.sysid.record import takes
 
     if listing:
@@ -131,8 +131,7 @@ def record(
     played = protocols_of(name, plan_file, seconds, setup)
     wanted = takes(recording_path(out), played, seed, repeats=repeats, hold_out_seed=hold_out_seed, hot_s=hot_s)
     for take in wanted:
-        if take.path.exists():
-            raise BadInput("there is a recording already", where=take.path, remedy="record under another name")
+        must_be_new(take.path)
     folder = robot_of(robot, needed=virtual_source is None)
     console = Console(stderr=True)
     placements = [

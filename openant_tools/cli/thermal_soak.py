@@ -114,7 +114,7 @@ def soak(
     from openant_tools.cli.thermal_curves import Curves
     from openant_tools.errors import BadInput
     from openant_tools.procedure.step import drive
-    from openant_tools.recording.writer import recording_path
+    from openant_tools.recording.writer import must_be_new, recording_path
     from openant_tools.robot.joints import JOINT_NAMES
     from openant_tools.thermal.soak import SoakPlan, pose_angles, resume_plan, soak_config
     from openant_tools.thermal.soak import soak as run_soak
@@ -125,10 +125,7 @@ def soak(
             raise BadInput("there is no soak to go on with", where=out, remedy="leave out --resume to begin one")
         plan = resume_plan(out)
     else:
-        if out.exists():
-            raise BadInput(
-                "there is a recording already", where=out, remedy="record under another name, or --resume it"
-            )
+        must_be_new(out, "record under another name, or --resume it")
         plan = SoakPlan(
             load="play" if commands else load,  # type: ignore[arg-type]
             seconds=minutes * 60,

@@ -120,7 +120,7 @@ def _record(command: messages.Record, servos: Servos, limits: Any) -> messages.R
         raise BadInput(f"Record.facts is {_words(command.facts)}", remedy="give Facts")
     if command.config is not None:
         _text("Record.config", command.config)
-    for name in ("overwrite", "resume", "pictures"):
+    for name in ("resume", "pictures"):
         _flag(f"Record.{name}", getattr(command, name))
     thin = command.thin_s
     if thin is not None and not _seconds("Record.thin_s", thin) > 0.0:

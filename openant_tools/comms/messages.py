@@ -208,7 +208,6 @@ class Record:
     path: str
     facts: Facts
     config: str | None = None
-    overwrite: bool = False
     resume: bool = False
     thin_s: float | None = None
     pictures: bool = False

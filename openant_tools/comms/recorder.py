@@ -89,7 +89,6 @@ class Recorder:
                 registers=settings.registers,
                 config=command.config,
                 clock=clock.now,
-                overwrite=command.overwrite,
                 continued=continued,
             )
         except (TypeError, ValueError, AttributeError) as error:

@@ -44,6 +44,11 @@ class Unfinished:
         """The first part that is left to do."""
         return next(part for part in self.of if part not in self.done)
 
+    def recording(self, folder: RobotFolder) -> Path | None:
+        """The one that its parts were recorded in, of a step that goes on with it; None where it is not there."""
+        path = folder.path / str(next(iter(self.done.values())).get("recording", ""))
+        return path if path.is_file() else None
+
     @property
     def words(self) -> str:
         """`4 of 8`."""

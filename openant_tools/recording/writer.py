@@ -33,7 +33,16 @@ from openant_tools.recording.pictures import PICTURE, PICTURE_TOPIC, picture_mes
 from openant_tools.recording.run import Facts
 from openant_tools.recording.telemetry import AGENT_TIMES, Cycle, ServoChannel, Telemetry
 
-__all__ = ["METADATA", "PROFILE", "SCHEMA", "Continued", "RecordingStopped", "RecordingWriter", "recording_path"]
+__all__ = [
+    "METADATA",
+    "PROFILE",
+    "SCHEMA",
+    "Continued",
+    "RecordingStopped",
+    "RecordingWriter",
+    "must_be_new",
+    "recording_path",
+]
 
 SCHEMA = "openant.recording/1"
 PROFILE = "openant"
@@ -61,6 +70,13 @@ def recording_path(path: str | Path) -> Path:
             remedy=f"record to {path.with_suffix('.mcap').name}, then `openant rec export` it to {path.suffix[1:]}",
         )
     return path if path.suffix == ".mcap" else path.with_name(path.name + ".mcap")
+
+
+def must_be_new(path: Path, remedy: str = "record under another name, or move that file away") -> None:
+    """Raises BadInput where something stands at `path` already, be it a link to nothing."""
+    if os.path.lexists(path):
+        what = "there is a recording already" if path.exists() else "this is a link to nothing"
+        raise BadInput(what, where=path, remedy=remedy)
 
 
 @dataclass(frozen=True)

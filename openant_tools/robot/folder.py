@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import math
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -93,6 +94,15 @@ class RobotFolder:
     @property
     def recordings(self) -> Path:
         return self.path / "recordings"
+
+    def new_recording(self, what: str) -> Path:
+        """Where a step records `what` this time, `recordings/WHAT-20261130T120000Z.mcap`: a name that nothing has, so that what it
+        finds keeps naming the recording that it was found in.
+        """
+        stem, n = f"{what}-{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%SZ}", 1
+        while os.path.lexists(path := self.recordings / (f"{stem}.mcap" if n == 1 else f"{stem}-{n}.mcap")):
+            n += 1
+        return path
 
     @property
     def findings(self) -> Path:

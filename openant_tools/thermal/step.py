@@ -10,7 +10,7 @@ from openant_tools.numbers import number
 from openant_tools.procedure.by_time import minutes, noted
 from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.step import Ask, Bench, Intent, Procedure, Say
-from openant_tools.procedure.unfinished import Parts, unfinished
+from openant_tools.procedure.unfinished import Parts, forget, unfinished
 from openant_tools.recording.tables import read_run
 from openant_tools.thermal.finding import thermal_finding, warning_of
 from openant_tools.thermal.fit import fit_and_judge
@@ -38,26 +38,28 @@ def thermal_soak(bench: Bench) -> Procedure:
     warning = warning_of(bench.folder.config())
     if warning:
         yield Say(warning, "warn")
-    path = bench.folder.recordings / "soak.mcap"
-    plan = _left(bench, path)
-    resume = plan is not None
-    if plan is None:
+    left = _left(bench)
+    resume = left is not None
+    if left is not None:
+        path, plan = left
+    else:
+        forget(bench.folder, "thermal")  # nothing of it is there any more
+        path = bench.folder.new_recording("soak")
         asked = yield Ask("Soak for how long?", unit="min", default=DEFAULT_MIN, low=SHORTEST_MIN, high=LONGEST_MIN)
         length = float(asked) if isinstance(asked, int | float) else DEFAULT_MIN
         plan = SoakPlan(load="hang", seconds=60 * length, cool_down_s=60 * COOLING_SHARE * length)
     parts = Parts(bench.folder, "thermal", minutes(plan.seconds + plan.cool_down_s))
-    if parts.before:
+    if resume:
         yield Say(parts.words)
     yield Intent(
         f"hold the home pose for {_minutes(plan.seconds)}, then let go and record {_minutes(plan.cool_down_s)} of cooling"
         + (", what was left of it" if resume else ""),
         moves=True,
     )
-    if not resume:
-        path.unlink(missing_ok=True)
     engine = soak_config(engine_config(bench, imu=None), RATE_HZ)
     text = bench.folder.config_file.read_text(encoding="utf-8")
-    yield from noted(soak(engine, plan, path, robot_toml=text, resume=resume), parts)
+    soaking = soak(engine, plan, path, robot_toml=text, resume=resume)
+    yield from noted(soaking, parts, recording=bench.folder.relative(path))
     parts.end()
     run = inputs_of(read_run(path, need=()))
     # What is forecast is the load, not the cooling after it.
@@ -70,13 +72,13 @@ def thermal_soak(bench: Bench) -> Procedure:
     return finding
 
 
-def _left(bench: Bench, path: Path) -> SoakPlan | None:
-    """The plan of the soak that was left in the middle; None where there is none, or none of its recording."""
+def _left(bench: Bench) -> tuple[Path, SoakPlan] | None:
+    """Recording and plan of the soak that was left in the middle; None where there is none, or none of its recording."""
     left = unfinished(bench.folder, "thermal")
-    if left is None or not path.is_file():
+    if left is None or (path := left.recording(bench.folder)) is None:
         return None
     try:
         plan = resume_plan(path)
     except BadInput:
         return None
-    return plan if left.of == minutes(plan.seconds + plan.cool_down_s) else None
+    return (path, plan) if left.of == minutes(plan.seconds + plan.cool_down_s) else None

@@ -119,6 +119,16 @@ def test_an_unchanged_robot_is_green(known):
         assert (finding.ok, finding.problems) == (True, ())
         assert joint_sweep_of(finding.data["sweep"]["hip_rr"]).friction_nm == pytest.approx(0.04, abs=0.01)
         assert not any(ant.torque())
+        kept = ant.recorded()
+        assert {f"recordings/{name}" for name in kept} >= set(finding.data["recordings"].split(", "))
+
+        def leave(event: Event) -> None:
+            if isinstance(event, Progress) and event.words == "slow sweep":
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(check(ant.bench), ant.builder(before=leave))
+        assert ant.recorded().items() > kept.items(), "a repeat that was cut short takes the place of nothing"
 
 
 @pytest.mark.slow

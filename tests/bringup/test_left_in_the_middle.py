@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ from openant_tools.bringup.comms_step import comms_step
 from openant_tools.bringup.identification import identification
 from openant_tools.bringup.walk import WALK
 from openant_tools.comms.soak import soaked_seconds
-from openant_tools.procedure.step import Answer, Ask, Bench, Event, Intent, Live, Procedure, Progress, Step
+from openant_tools.errors import HardwareFault
+from openant_tools.procedure.step import Answer, Ask, Bench, Declined, Event, Intent, Live, Procedure, Progress, Step
 from openant_tools.procedure.unfinished import Unfinished, unfinished
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
@@ -21,6 +23,7 @@ from openant_tools.recording.telemetry import Cycle, RecordedAnswer, ServoChanne
 from openant_tools.recording.writer import RecordingWriter
 from openant_tools.robot.config import Provenance
 from openant_tools.sysid.bench.steps import floor_friction
+from openant_tools.thermal.step import thermal_soak
 
 pytestmark = pytest.mark.usefixtures("half_rate")
 
@@ -59,21 +62,61 @@ def test_every_step_with_parts_notes_them(step: Step) -> None:
 
 
 def test_a_watch_over_the_bus_goes_on_with_its_next_minute(tmp_path: Path) -> None:
-    soak = tmp_path / "ant" / "recordings" / "comms-soak.mcap"
     with robot(tmp_path / "ant") as there:
         note = left(
             there, comms_step, "comms", lambda event: isinstance(event, Progress) and (event.share or 0) > 0.68 and "lost" in event.words,
             **{"how long": 1.5},
         )  # fmt: skip
         assert (note.words, note.next) == ("1 of 2", "minute 2")
+        (soak,) = there.folder.recordings.iterdir()
         before = soaked_seconds(soak)
         finding, builder = there.do(comms_step(there.bench))
     assert finding.ok, finding
     assert not asked(builder)
     assert "swing all legs gently on the stand until it was 1.5 min in all" in builder.said
     assert 55 < before < 75
+    assert list(there.folder.recordings.iterdir()) == [soak]
     assert soaked_seconds(soak) == pytest.approx(90, abs=3)
     assert unfinished(there.folder, "comms") is None
+
+
+class Refusing(Builder):
+    """Says No to whatever would move."""
+
+    def answer(self, event: Event) -> Answer:
+        return False if isinstance(event, Intent) else super().answer(event)
+
+
+@pytest.mark.parametrize("step", [thermal_soak, comms_step])
+def test_a_finished_soak_stays_whatever_becomes_of_the_next(
+    step: Callable[[Bench], Procedure], tmp_path: Path, brisk: None
+) -> None:
+    """A No, a port that is not there, Ctrl-C in the middle of the next; that one, whole, has a name of its own."""
+
+    def leave(event: Event) -> None:
+        if isinstance(event, Progress) and (
+            ("holding" in event.words and (event.share or 0) > 0.4) or "lost" in event.words
+        ):
+            raise KeyboardInterrupt
+
+    with robot(tmp_path / "ant", clock={"mode": "stepped", "doze": step is thermal_soak}) as there:
+        first, _ = there.do(step(there.bench))
+        (whole,) = kept = there.recorded()
+        with pytest.raises(Declined):
+            there.do(step(there.bench), Refusing(there.control))
+        with pytest.raises(HardwareFault):
+            there.do(step(replace(there.bench, bus="/dev/ttyUSB9", control=None)))
+        assert there.recorded() == kept
+        with pytest.raises(KeyboardInterrupt):
+            there.do(step(there.bench), there.builder(before=leave))
+        assert len(there.recorded()) == 2
+        assert there.recorded().items() >= kept.items()
+        kept = there.recorded()
+        last, _ = there.do(step(there.bench))
+        assert there.recorded()[whole] == kept[whole]
+    assert whole in str(first)
+    assert whole not in str(last)
+    assert any(name in str(last) for name in there.recorded())
 
 
 def test_a_pause_does_not_count_as_soaking(tmp_path: Path) -> None:
@@ -122,6 +165,7 @@ def test_motions_that_were_recorded_are_not_played_again_unless_the_robot_is_ano
     assert finding.step == "identify"
     assert [event.words.split(", ")[2] for event in builder.events if isinstance(event, Intent)] == ["1 × 5 s"]
     assert {name: (there.folder.recordings / name).read_bytes() for name in recorded} == recorded
+    assert [name for name in there.recorded() if "out-2-cut-short" in name], "what was cut short is kept, too"
     assert unfinished(there.folder, "identify") is None
 
 

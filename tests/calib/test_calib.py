@@ -314,6 +314,13 @@ def test_bounds_that_were_left_after_the_sweep_do_not_sweep_again(tmp_path, bris
         moving = [event.words for event in builder.events if isinstance(event, Intent) and event.moves]
         assert (moving, [e for e in builder.events if isinstance(e, Ask)]) == ([], [])
         assert unfinished(ant.folder, "bounds") is None
+        kept = ant.recorded()
+        named = {name.removeprefix("recordings/") for name in finding.data["recordings"].split(", ")}
+        assert len(named) == 3
+        assert named <= set(kept), "and what was left in the middle stands beside them"
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(bounds(ant.bench), ant.builder(before=leave_at(Progress, "slow sweep")))
+        assert ant.recorded().items() > kept.items(), "a repeat that was cut short takes the place of nothing"
 
 
 def test_an_imu_whose_poses_were_left_goes_on_with_the_next_and_another_board_begins_anew(tmp_path):
@@ -865,8 +872,12 @@ def test_the_arena_is_measured_by_the_robot_itself_which_moves_once_however_ofte
             in finding.problems[1]
         )
         assert ant.folder.config().imu.gyro_counts_per_dps == pytest.approx(1000 / 70, abs=1e-4)
-        recorded = read_recording(ant.folder.recordings / "arena.mcap")
+        recorded = read_recording(ant.folder.path / finding.data["recordings"])
         assert recorded.run.facts.extra["imu"]["gyro_counts_per_dps"] == pytest.approx(16.384)
+        kept = ant.recorded()
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(arena(ant.bench), ant.builder(before=leave_at(Progress, arena_step.MOTION)))
+        assert ant.recorded().items() > kept.items(), "a repeat that was cut short takes the place of nothing"
 
 
 # ---- bus health -------------------------------------------------------------------------------------------------------

@@ -309,6 +309,16 @@ def test_other_commands_refuse_in_one_line_too(
     assert set(bench.rglob("*")) == before
 
 
+@pytest.mark.parametrize("command", [("sysid", "record"), ("thermal", "soak"), ("comms", "soak")])
+def test_a_link_to_nothing_is_no_name_for_a_recording_and_said_before_it_connects(
+    tmp_path: Path, within: Callable[..., Result], command: tuple[str, ...]
+) -> None:
+    (tmp_path / "run.mcap").symlink_to(tmp_path / "gone.mcap")
+    result = within(*command, "--virtual", "nowhere.json", "--out", str(tmp_path / "run.mcap"), "--yes")
+    assert "run.mcap: this is a link to nothing" in refusal(result)
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
+
+
 def test_unattended_training_tells_what_goes_on_alone_before_anybody_gives_the_word(
     within: Callable[..., Result], tmp_path: Path
 ) -> None:

@@ -519,7 +519,8 @@ def test_the_walks_step_soaks_fits_and_finds(tmp_path: Path) -> None:
     assert finding.ok, finding.problems
     assert any(one.name == "knee_fl holds for ever" for one in finding.evidence)
     assert "hold the home pose for 2 min" in builder.said
-    assert (tmp_path / "ant" / "recordings" / "soak.mcap").is_file()
+    (recording,) = (tmp_path / "ant" / "recordings").iterdir()
+    assert finding.data["recording"] == f"recordings/{recording.name}"
 
 
 def test_a_soak_that_was_stopped_goes_on_with_its_next_minute(tmp_path: Path) -> None:
@@ -534,7 +535,8 @@ def test_a_soak_that_was_stopped_goes_on_with_its_next_minute(tmp_path: Path) ->
             raise KeyboardInterrupt
 
     def torque_on_s() -> float:
-        run = read_recording(tmp_path / "ant" / "recordings" / "soak.mcap").run
+        (soak,) = (tmp_path / "ant" / "recordings").iterdir()  # gone on with, it is one
+        run = read_recording(soak).run
         step = np.diff(run.t, append=run.t[-1])
         return float(step[(run.signal("torque").max(axis=1) > 0) & (step < 5)].sum())
 
