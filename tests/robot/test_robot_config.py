@@ -686,7 +686,7 @@ def test_new_show_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str], m
     code, out, _ = run(capsys, "config", "show", "--json", tmp_path / "show.json")
     assert code == 0
     assert "Berta (lite kit)" in out
-    assert "measured in recordings/zeros.mcap on 2026-03-01 (0.780 to 0.800)" in out
+    assert "measured in recordings/zeros.mcap on 2026-03-01 (44.7 to 45.8°)" in out
     shown = json.loads((tmp_path / "show.json").read_text(encoding="utf-8"))
     assert shown["motors"]["hip_rr"]["zero_offset_rad"] == 0.79
     code, out, _ = run(capsys, "config", "check", "--json", tmp_path / "check.json")
