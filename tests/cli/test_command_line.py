@@ -571,9 +571,9 @@ def test_a_stream_that_is_not_there_is_no_terminal(monkeypatch: pytest.MonkeyPat
     for name in ("stdin", "stdout", "stderr"):
         monkeypatch.setattr(sys, name, io.StringIO())
         getattr(sys, name).close()
-        assert not has_terminal(name)  # type: ignore[arg-type]
+        assert not has_terminal(name)
         monkeypatch.setattr(sys, name, None)
-        assert not has_terminal(name)  # type: ignore[arg-type]
+        assert not has_terminal(name)
     assert CommandFace(yes=True).answer(Ask("Which?", default="this one", unit="text")) == "this one"
     with pytest.raises(BadInput, match="nobody is there to ask"):
         CommandFace(yes=False).answer(Ask("Which?", unit="text"))

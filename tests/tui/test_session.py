@@ -109,7 +109,10 @@ def test_a_robot_that_cannot_be_made_here_says_where_and_why(tmp_path: Path) -> 
         Session(tmp_path).create(tmp_path / "file" / "ant", "standard")
 
 
-def test_a_robot_that_another_program_holds_can_be_read_here_and_no_more(tmp_path: Path) -> None:
+def test_a_robot_that_another_program_holds_can_be_read_here_and_no_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OPENANT_HELD_BY", raising=False)  # of who holds it with us
     folder = create_robot(tmp_path / "ant", "standard")
     other = Claim(folder.path / ".robot.lock", "held by {}", remedy="")
     [said] = Session(folder.path).notices
