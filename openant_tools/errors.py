@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
+from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["BadInput", "HardwareFault", "OpenAntError", "StorageFault"]
+__all__ = ["BadInput", "HardwareFault", "OpenAntError", "StorageFault", "system_fault", "system_faults"]
 
 #: characters of a part of a message: files may hold names of any length, and they are quoted
 LONGEST = 400
+#: what to do about an error of the operating system; {again} is what to do once that is done
+_MAKE_ROOM = "make room there, or choose another place, and {again}"
+_OTHER_PLACE = "choose a place that you may write to"
+_REMEDIES = {
+    errno.ENOSPC: _MAKE_ROOM,
+    errno.EDQUOT: _MAKE_ROOM,
+    errno.EFBIG: _MAKE_ROOM,
+    errno.EACCES: _OTHER_PLACE,
+    errno.EPERM: _OTHER_PLACE,
+    errno.EROFS: _OTHER_PLACE,
+    errno.ENOTDIR: "a part of this path is a file: choose another place",
+}
 
 
 class OpenAntError(Exception):
@@ -53,3 +68,27 @@ class StorageFault(OpenAntError):
 
 class HardwareFault(OpenAntError):
     """A robot, real or virtual, that does not answer as it should."""
+
+
+def system_fault(error: OSError, *, where: str | Path | None = None, again: str = "repeat the command") -> OpenAntError:
+    """An error of the operating system as one of ours: a full disk, a missing directory, a permission.
+
+    Args:
+        where: the place, where the error names no file.
+        again: what to do once the cause is gone.
+    """
+    remedy = _REMEDIES.get(error.errno or 0)
+    return OpenAntError(
+        error.strerror or str(error),
+        where=error.filename or where,
+        remedy=None if remedy is None else remedy.format(again=again),
+    )
+
+
+@contextlib.contextmanager
+def system_faults(*, where: str | Path | None = None, again: str = "repeat the command") -> Iterator[None]:
+    """A block whose errors of the operating system become `system_fault`s."""
+    try:
+        yield
+    except OSError as error:
+        raise system_fault(error, where=where, again=again) from error

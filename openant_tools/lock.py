@@ -12,19 +12,20 @@ from __future__ import annotations
 import contextlib
 import errno
 import importlib.util
+import itertools
 import os
 import shlex
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
 from openant_tools.errors import BadInput
 
-__all__ = ["Claim", "Holder", "held", "holder", "wait_for"]
+__all__ = ["Claim", "Holder", "held", "holder", "typed", "wait_for"]
 
 #: s for which a claim is tried again: whoever only asks who holds a lock holds it for a moment, too
 PATIENCE_S = 0.5
@@ -219,9 +220,10 @@ def _named(file: IO[bytes]) -> Holder:
 def _own_command() -> str:
     """This process as its user typed it, to the first option."""
     program = Path(sys.argv[0] if sys.argv else "").name
-    words = ["openant" if program in ("openant", "__main__.py") else program or "python"]
-    for word in sys.argv[1:4]:
-        if word.startswith("-"):
-            break
-        words.append(word)
-    return shlex.join(words)
+    return typed("openant" if program in ("openant", "__main__.py") else program or "python", sys.argv[1:])
+
+
+def typed(program: str, given: Sequence[str]) -> str:
+    """A program with the words that it was given, to the first option: three at most."""
+    words = itertools.takewhile(lambda word: not word.startswith("-"), given[:3])
+    return shlex.join([program, *words])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import errno
 import importlib
 import logging
 import os
@@ -17,7 +16,8 @@ import click
 
 from openant_tools.cli.leaving import heed_signals
 from openant_tools.cli.log import begin, log_options
-from openant_tools.errors import OpenAntError
+from openant_tools.cli.streams import has_terminal, open_closed_streams
+from openant_tools.errors import OpenAntError, system_fault
 from openant_tools.opengl import load_no_window_library
 from openant_tools.trust import TRUST, trusted
 from openant_tools.workers import end_with_who_started_us
@@ -52,18 +52,6 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
 INTERRUPTED = 130
 
 _log = logging.getLogger(__name__)
-
-_MAKE_ROOM = "make room there, or choose another place, and repeat the command"
-_OTHER_PLACE = "choose a place that you may write to"
-REMEDIES = {
-    errno.ENOSPC: _MAKE_ROOM,
-    errno.EDQUOT: _MAKE_ROOM,
-    errno.EFBIG: _MAKE_ROOM,
-    errno.EACCES: _OTHER_PLACE,
-    errno.EPERM: _OTHER_PLACE,
-    errno.EROFS: _OTHER_PLACE,
-    errno.ENOTDIR: "a part of this path is a file: choose another place",
-}
 
 
 def common_options(command: click.Command) -> click.Command:
@@ -162,7 +150,7 @@ def openant(context: click.Context, robot: Path | None, virtual_source: str | No
             raise click.UsageError("--robot, --virtual and --serve before a command are for none: give them after it")
         return None
     # A browser's server runs this program with a driver of its own, and pipes.
-    shown = (sys.stdin.isatty() and sys.stdout.isatty()) or "TEXTUAL_DRIVER" in os.environ
+    shown = has_terminal("stdin", "stdout") or "TEXTUAL_DRIVER" in os.environ
     if port is None and not shown:
         raise click.exceptions.NoArgsIsHelpError(context)
     from openant_tools.cli import terminal
@@ -174,6 +162,7 @@ def openant(context: click.Context, robot: Path | None, virtual_source: str | No
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line; exits with 0, 1, 2 or 130 (formats, section 6), never a traceback for bad input."""
+    open_closed_streams()
     heed_signals()
     end_with_who_started_us()
     begin(list(sys.argv[1:] if argv is None else map(str, argv)))
@@ -195,10 +184,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         click.echo(f"{command}: {words.removesuffix('.')} → `{command} --help` says what it takes", err=True)
         sys.exit(2)
     except OSError as error:
-        # A full disk, a missing directory, a permission: the operating system's own words name the cause.
-        where = f"{error.filename}: " if error.filename else ""
-        remedy = REMEDIES.get(error.errno or 0)
-        click.echo(f"openant: {where}{error.strerror or error}" + (f" → {remedy}" if remedy else ""), err=True)
+        click.echo(f"openant: {system_fault(error)}", err=True)
         sys.exit(2)
     except BrokenExecutor:
         click.echo(

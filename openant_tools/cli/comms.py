@@ -62,7 +62,7 @@ def ports(json_file: Path | None) -> None:
         slow = slow or (port.latency_timer_ms or 0) > WANTED_LATENCY_MS
         words = {"bus": "servo bus", "imu": "flight controller", "unknown": port.product or "unknown"}[port.kind]
         click.echo(f"{port.stable_path}  {words}  {port.vendor_id}:{port.product_id}{timer}")
-        for holder in host.holders(port.path):
+        for holder in host.readers(port.path):
             click.echo(f"  held by {holder.command} (process {holder.pid})")
         group = host.missing_group(port.path)
         if group:

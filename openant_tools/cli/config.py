@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ import click
 
 from openant_tools.cli.log import mention
 from openant_tools.cli.options import json_option, robot_folder, robot_option
+from openant_tools.cli.streams import has_terminal
 from openant_tools.errors import BadInput
 from openant_tools.numbers import exact, number, span
 
@@ -194,7 +194,7 @@ def _print(folder: RobotFolder, configuration: RobotConfig) -> None:
     from rich.table import Table
 
     # In a pipe there is no width to obey, and a wrapped table is hard to read.
-    console = Console(width=None if sys.stdout.isatty() else 160)
+    console = Console(width=None if has_terminal("stdout") else 160)
     facts = Table(show_header=False, box=None, pad_edge=False)
     rows: list[tuple[str, Any]] = [
         ("robot", f"{configuration.name} ({configuration.kit} kit)"),

@@ -13,6 +13,7 @@ from rich.prompt import Confirm, FloatPrompt, Prompt
 
 from openant_tools.cli.hardware import need_moving, need_terminal
 from openant_tools.cli.log import is_quiet
+from openant_tools.cli.streams import has_terminal
 from openant_tools.errors import BadInput
 from openant_tools.numbers import number, percent, span
 from openant_tools.procedure.finding import Finding
@@ -162,7 +163,7 @@ class CommandFace:
 
     def _show(self, live: Live) -> bool:
         """Bars that stay in place on a terminal, nothing where the output goes to a file; whether Enter was pressed since."""
-        watched = not self._yes and sys.stdin.isatty()
+        watched = not self._yes and has_terminal()
         if watched and not self._watching:  # a key that was pressed before counts for nothing that comes later
             while _entered():
                 pass

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from openant_tools.cli.leaving import MOVES, end_with_the_terminal
+from openant_tools.cli.streams import has_terminal
 from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_robot
 from openant_tools.errors import BadInput
 
@@ -118,7 +118,7 @@ def engine_config(
 
 def need_terminal(why: str, remedy: str = "add --yes if it may") -> None:
     """Go on only where somebody can be asked; raises BadInput."""
-    if not sys.stdin.isatty():
+    if not has_terminal():
         raise BadInput(f"{why} and nobody is there to ask", remedy=remedy)
 
 

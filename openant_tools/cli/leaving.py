@@ -12,6 +12,7 @@ from types import FrameType
 
 import click
 
+from openant_tools.cli.streams import has_terminal
 from openant_tools.signals import SUSPENDED, TERMINAL_GONE, TOLD_TO_GO, heard
 
 __all__ = ["MOVES", "end_with_the_terminal", "heed_signals"]
@@ -41,7 +42,7 @@ def end_with_the_terminal() -> None:
         return
     poll = select.poll()
     for fd in (0, 1, 2):
-        if fd > 0 or os.isatty(fd):  # an input that ends is no terminal that is gone
+        if fd > 0 or has_terminal():  # an input that ends is no terminal that is gone
             poll.register(fd, 0)
 
     def wait() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +20,7 @@ from openant_tools.cli.hardware import (
 )
 from openant_tools.cli.options import Number, rate_option, robot_option, seconds_option
 from openant_tools.cli.progress import BarFace, progress_bar
+from openant_tools.cli.streams import has_terminal
 from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
 from openant_tools.numbers import exact, number, span
 
@@ -143,7 +143,7 @@ def record(
     for k, place in enumerate(placements):
         protocol = place[0].protocol
         if k and not moves_itself:
-            if yes or not sys.stdin.isatty():
+            if yes or not has_terminal():
                 rest = "; ".join(_where(later[0].protocol) for later in placements[k:])
                 console.print(
                     f"left out, since nobody is asked to move the robot: {rest}; record it with --setup floor"

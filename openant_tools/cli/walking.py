@@ -16,6 +16,7 @@ from openant_agents.places import HARDWARE_ID
 from openant_tools.cli.hardware import may_move, record_pictures_option
 from openant_tools.cli.learning import robot_argument
 from openant_tools.cli.log import mention
+from openant_tools.cli.streams import has_terminal
 from openant_tools.cli.virtual_for_command import virtual_option
 from openant_tools.errors import BadInput
 
@@ -118,7 +119,7 @@ def environment(
         if said is not None:
             said(words)
 
-    attended = sys.stdin.isatty() and not unattended
+    attended = has_terminal() and not unattended
     env = gymnasium.make(
         name, **options, recordings=recordings, notice=notice, attended=attended, unattended=unattended
     )
@@ -132,7 +133,7 @@ def environment(
 @contextlib.contextmanager
 def _pause_key(env: AntHardware) -> Iterator[None]:
     """While a terminal is attached, the space bar pauses the robot and lets it go on."""
-    if not sys.stdin.isatty():
+    if not has_terminal():
         yield
         return
     import select

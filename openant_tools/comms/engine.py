@@ -44,7 +44,7 @@ from openant_tools.comms.restart import StopCause
 from openant_tools.comms.ring import Ring, joint_values
 from openant_tools.comms.servos import Block
 from openant_tools.comms.silence import explained
-from openant_tools.errors import BadInput, HardwareFault, OpenAntError
+from openant_tools.errors import BadInput, HardwareFault, OpenAntError, system_fault
 from openant_tools.recording.writer import RecordingStopped
 from openant_tools.scheduling import LOOP, in_time
 from openant_tools.signals import TOLD_TO_GO
@@ -103,7 +103,8 @@ def _connected(config: EngineConfig, parent: Parent, ring: Ring, owned: contextl
         owned.callback(_end_recording, recorder, parent)
         hardware = take_over(config, port, sensors, owned, parent.notice)
         parent.say(messages.Reply(0, value=hardware.description()))
-    except OpenAntError as fault:
+    except (OpenAntError, OSError) as error:
+        fault = system_fault(error, again="connect again") if isinstance(error, OSError) else error
         parent.say(messages.Reply(0, error=(fault.what, fault.where, fault.remedy)))
         return None
     return Engine(hardware, recorder, parent, ring)

@@ -29,7 +29,7 @@ from openant_tools.comms.servo_settings import ServoSettings
 from openant_tools.comms.servos import Servo, Servos
 from openant_tools.comms.silence import explaining
 from openant_tools.comms.state import EXTENDED_POSITION, POSITION, in_words, refusal, stopping
-from openant_tools.errors import HardwareFault
+from openant_tools.errors import HardwareFault, StorageFault
 from openant_tools.numbers import exact, number, percent
 from openant_tools.procedure.journal import EepromWrite, Journal
 from openant_tools.robot.registers import PWM_FULL
@@ -267,8 +267,17 @@ def _set_up(
 
 
 def _note_write(journal: str | None, change: EepromWrite) -> None:
-    if journal is not None:
+    if journal is None:
+        return
+    try:
         Journal(Path(journal)).append(change, "engine")
+    except OSError as error:
+        raise StorageFault(
+            f"the journal cannot be written ({error.strerror or error}), so {change.register} of {change.joint} was not "
+            "written to its servo",
+            where=journal,
+            remedy="make room there, or make the robot's folder one that can be written to, and try again",
+        ) from error
 
 
 def _release(port: EnginePort, servos: Servos, notice: Callable[[str], None]) -> None:

@@ -17,6 +17,7 @@ from typing import Literal
 
 from openant_tools.comms.troubles import PORT
 from openant_tools.errors import HardwareFault
+from openant_tools.lock import typed
 
 __all__ = ["FLIGHT_CONTROLLER", "U2D2", "Host", "Port", "PortHolder", "explain_open_error", "udev_rule"]
 
@@ -25,8 +26,10 @@ U2D2 = ("0403", "6014")
 FLIGHT_CONTROLLER = ("0483", "5740")
 #: 1 ms instead of the driver's 16: every reply of a servo is shorter than the adapter's buffer.
 WANTED_LATENCY_MS = 1
-#: what the command line of an engine's guardian holds
-GUARDIAN = "guardian"
+#: what the command line of an engine and of its guardian holds
+ENGINE, GUARDIAN = "openant_tools.comms.engine", "guardian.py"
+#: as which `python -m` starts the command line
+OPENANT = ("openant_tools", "openant_tools.cli")
 _TTY_MAJOR_NAMES = ("ttyUSB", "ttyACM")
 
 Kind = Literal["bus", "imu", "unknown"]
@@ -158,28 +161,73 @@ class Host:
             return found
         for process in processes:
             try:
-                targets = [os.readlink(descriptor) for descriptor in (process / "fd").iterdir()]
+                targets = {descriptor.name: os.readlink(descriptor) for descriptor in (process / "fd").iterdir()}
             except OSError:
                 continue  # another user's, or gone meanwhile
-            if any(Path(target).name == name and "/dev/" in target for target in targets):
+            if any(
+                Path(target).name == name and "/dev/" in target and _may_be(path, process / "fd" / number)
+                for number, target in targets.items()
+            ):
                 words = _bytes(process / "cmdline").replace(b"\0", b" ").decode(errors="replace").strip()
                 found.append(PortHolder(int(process.name), words or _text(process / "comm")))
         return found
 
     def readers(self, path: str) -> list[PortHolder]:
-        """Other programs that have the port open: each takes some of the bytes that come.
+        """Other programs that have the port open, as their users know them: each takes some of the bytes that come.
 
-        This process, its guardian and the far end of a pseudo-terminal are none.
+        This process, its guardian and the far end of a pseudo-terminal are none. An engine and its guardian are the
+        program that started them.
         """
         name, own = self._name(path), os.getpid()
         far = name if Path(os.path.realpath(path)).parent.name == "pts" else None
-        return [
-            holder
-            for holder in self.holders(path)
-            if holder.pid != own
-            and not (GUARDIAN in holder.command and self._parent(holder.pid) == own)
-            and not (far and self._is_far_end(holder.pid, far))
-        ]
+        found = dict[int, PortHolder]()
+        for holder in self.holders(path):
+            ours = holder.pid == own or (self._is_guardian(holder.pid) and self._parent(holder.pid) == own)
+            if not ours and not (far and self._is_far_end(holder.pid, far)):
+                program = self._program_of(holder)
+                found.setdefault(program.pid, program)
+        return list(found.values())
+
+    def _program_of(self, holder: PortHolder) -> PortHolder:
+        """Who started a guardian, and an engine; itself where that cannot be seen, is gone, or has started us, too."""
+        pid = holder.pid
+        if self._is_guardian(pid):
+            parent = self._parent(pid)
+            pid = parent if parent and self._is_engine(parent) else pid
+        if self._is_engine(pid):
+            parent = self._parent(pid)
+            pid = parent if parent and self._is_python(parent) and parent not in self._ancestors() else pid
+        return holder if pid == holder.pid and not self._is_openant(pid) else PortHolder(pid, self._command(pid))
+
+    def _words(self, pid: int) -> list[str]:
+        return [word.decode(errors="replace") for word in _bytes(self.proc / str(pid) / "cmdline").split(b"\0") if word]
+
+    def _command(self, pid: int) -> str:
+        """What a process was started as: of ours as its user typed it, to the first option."""
+        words = self._words(pid)
+        at = _openant_at(words)
+        return " ".join(words) or _text(self.proc / str(pid) / "comm") if at is None else typed("openant", words[at:])
+
+    def _is_openant(self, pid: int) -> bool:
+        return _openant_at(self._words(pid)) is not None
+
+    def _is_engine(self, pid: int) -> bool:
+        return ENGINE in self._words(pid)
+
+    def _is_guardian(self, pid: int) -> bool:
+        return any(Path(word).name == GUARDIAN for word in self._words(pid))
+
+    def _is_python(self, pid: int) -> bool:
+        """Whether it may have started an engine: one whose parent has died is the child of whoever takes such in."""
+        words = self._words(pid)
+        return bool(words) and ("python" in Path(words[0]).name.lower() or self._is_openant(pid))
+
+    def _ancestors(self) -> set[int]:
+        found, pid = set[int](), self._parent(os.getpid())
+        while pid and pid not in found:
+            found.add(pid)
+            pid = self._parent(pid)
+        return found
 
     def _parent(self, pid: int) -> int | None:
         # "41 (a name) S 40 …": a name may hold blanks and brackets
@@ -242,7 +290,7 @@ def _why_closed(path: str, error: Exception, host: Host) -> tuple[str, dict[str,
         group = host.missing_group(path)
         return ("forbidden", {"group": group}) if group else ("forbidden_by_mode", {})
     if code in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "lock" in str(error).lower():
-        holders = [holder for holder in host.holders(path) if holder.pid != os.getpid()]
+        holders = host.readers(path)
         who = ", ".join(f"{holder.command} (process {holder.pid})" for holder in holders)
         return ("held", {"who": who}) if holders else ("held_by_unseen", {})
     if sys.platform == "darwin" and "/tty." in path:
@@ -263,6 +311,27 @@ def _by_pyserial() -> Iterator[Port]:
                 serial_number=found.serial_number or "",
                 product=found.product or "",
             )
+
+
+def _may_be(path: str, descriptor: Path) -> bool:
+    """Whether an open file of that name may be this port: each container has a /dev/pts of its own, with the same names."""
+    try:
+        there, here = os.stat(descriptor), os.stat(path)
+    except OSError:
+        return True  # not to be found out: its name says so
+    pseudo = Path(os.path.realpath(path)).parent.name == "pts"
+    return there.st_rdev == here.st_rdev and (not pseudo or there.st_dev == here.st_dev)
+
+
+def _openant_at(words: list[str]) -> int | None:
+    """Where in a process's words those for `openant` begin; None where it is another program."""
+    python = bool(words) and "python" in Path(words[0]).name.lower()
+    for k, word in enumerate(words[: 6 if python else 1]):
+        if Path(word).name in ("openant", "openant.exe") or (k and words[k - 1] == "-m" and word in OPENANT):
+            return k + 1
+        if word.endswith(".py"):
+            break
+    return None
 
 
 def _bytes(path: Path) -> bytes:

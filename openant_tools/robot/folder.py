@@ -41,7 +41,7 @@ NOMINAL_MODEL = "nominal.xml"
 #: s for which a change of `robot.toml` waits for another's to be done
 CHANGE_PATIENCE_S = 30.0
 HELD = "this robot is held by {}"
-WAIT = "wait for it, or stop it; what only reads goes on"
+WAIT = "wait for it, or stop it; its findings and recordings can be read meanwhile"
 
 Document = TypeVar("Document", bound=Mapping[str, Any])
 

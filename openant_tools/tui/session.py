@@ -14,7 +14,7 @@ from openant_tools.comms.messages import EngineConfig, Notice, Stopped
 from openant_tools.comms.release import release_all
 from openant_tools.comms.setup import config_of_robot, config_of_unknown_robot, find_bus, imu_of_robot
 from openant_tools.comms.state import passport_registers
-from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.errors import BadInput, HardwareFault, system_faults
 from openant_tools.procedure.step import Bench
 from openant_tools.robot.config import CONFIG_NAME
 from openant_tools.robot.folder import RobotFolder, create_robot
@@ -23,7 +23,7 @@ from openant_tools.tui.faults import FaultList
 from openant_tools.tui.feeds import Feed, History, LiveFeed, ReplayFeed
 from openant_tools.tui.process import Process
 from openant_tools.tui.training import PlayProcess, TrainingProcess
-from openant_tools.virtual.process import VIRTUAL_DEFAULT, virtual_robot
+from openant_tools.virtual.process import VIRTUAL_DEFAULT, read_ready_file, ready_file, virtual_robot
 
 __all__ = ["Session"]
 
@@ -55,6 +55,8 @@ class Session:
         self.training: TrainingProcess | PlayProcess | None = None
         self.diagnosing: Process | None = None
         self._engine: EngineProcess | None = None
+        #: of a virtual robot that somebody else started, and may start anew
+        self._ready_file: Path | None = None
         self._virtual_process = contextlib.ExitStack()
         #: one thread connects or starts a robot at a time
         self._busy = threading.Lock()
@@ -95,11 +97,14 @@ class Session:
     def _say_who_holds(self) -> None:
         who = None if self.folder is None else self.folder.holder
         if who is not None:
-            self.notices.append(f"this robot is held by {who}: here you can look at it, but neither move nor change it")
+            self.notices.append(
+                f"this robot is held by {who}: here you can read its findings and recordings, but neither watch, move nor change it"
+            )
 
     def create(self, path: Path, kit: str) -> None:
         """Make a robot's folder with the nominal values of its kit; raises BadInput."""
-        create_robot(path, kit)
+        with system_faults(where=path, again="try again"):
+            create_robot(path, kit)
         self.open(path)
 
     def bench(self) -> Bench:
@@ -113,6 +118,7 @@ class Session:
             )
         if self.virtual is None:
             return Bench(folder)
+        self._find_virtual()
         bus, imu, camera, control = (self.virtual[key] for key in ("bus", "imu", "camera", "control"))
         return Bench(folder, bus, imu, camera, control)
 
@@ -127,10 +133,10 @@ class Session:
         Raises:
             OpenAntError: it cannot be started.
         """
-        with self._busy:
+        with self._busy, system_faults(where=self.path, again="try again"):
             self._disconnect()
             self._virtual_process.close()
-            self.virtual = None
+            self.virtual = self._ready_file = None
             folder = self.folder
             if source is None and folder is not None:
                 from openant_tools.bringup.persistent_robot import persistent_robot  # it loads MuJoCo
@@ -141,12 +147,19 @@ class Session:
             else:
                 process = virtual_robot(source or VIRTUAL_DEFAULT, clock=clock)
                 self.virtual = self._virtual_process.enter_context(process)
+                self._ready_file = ready_file(source or VIRTUAL_DEFAULT)
+
+    def _find_virtual(self) -> None:
+        """Where a virtual robot that somebody else started listens now; as before where its ready file cannot be read."""
+        if self._ready_file is not None:
+            with contextlib.suppress(BadInput, OSError):
+                self.virtual = read_ready_file(self._ready_file)
 
     def end_virtual(self) -> None:
         with self._busy:
             self._disconnect()
             self._virtual_process.close()
-            self.virtual = None
+            self.virtual = self._ready_file = None
 
     # ---- watching it ---------------------------------------------------------------------------------------------
 
@@ -160,8 +173,9 @@ class Session:
         Raises:
             OpenAntError: no bus, or not all servos answer.
         """
-        with self._busy:
+        with self._busy, system_faults(where=self.path, again="try again"):
             if self._engine is None:
+                self._find_virtual()
                 self._engine = EngineProcess(self._config())
 
     def disconnect(self) -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import traceback
 from collections.abc import Callable
+from pathlib import Path
 
 from openant_tools.bringup.simulated_builder import SimulatedBuilder
-from openant_tools.errors import OpenAntError
+from openant_tools.errors import OpenAntError, system_fault
 from openant_tools.procedure.finding import Finding, keep
 from openant_tools.procedure.step import Answer, Ask, Bench, Declined, Event, Hands, Intent, Live, Step, drive
 
@@ -111,13 +113,17 @@ class StepRun:
                 keep(finding, self._bench.folder)
         except (OpenAntError, OSError) as error:
             # Of what was ended from here that is the reason, whatever broke off by it.
-            self._done(None, str(self._ended or error))
+            self._done(None, str(self._ended or _ours(error, self._bench.folder.path)))
         except ModuleNotFoundError as error:
             self._done(None, f"this step needs the package {error.name}, which is not installed")
         except Exception as error:  # a fault of the program: the builder sees it, torque is off, the file has the rest
             log = self._bench.folder.path / ERRORS
-            with log.open("a", encoding="utf-8") as file:
+            with contextlib.suppress(OSError), log.open("a", encoding="utf-8") as file:  # a full disk keeps no more
                 traceback.print_exc(file=file)
             self._done(None, f"{type(error).__name__}: {error} → this is a fault of the program; please report {log}")
         else:
             self._done(finding, "")
+
+
+def _ours(error: OpenAntError | OSError, folder: Path) -> OpenAntError:
+    return system_fault(error, where=folder, again="begin the step again") if isinstance(error, OSError) else error

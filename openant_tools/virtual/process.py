@@ -16,7 +16,15 @@ from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.files import read_json
 from openant_tools.numbers import exact
 
-__all__ = ["VIRTUAL_DEFAULT", "clock_of_its_own", "placeable", "placed", "virtual_robot"]
+__all__ = [
+    "VIRTUAL_DEFAULT",
+    "clock_of_its_own",
+    "placeable",
+    "placed",
+    "read_ready_file",
+    "ready_file",
+    "virtual_robot",
+]
 
 #: the source that stands for a healthy standard Ant on its stand
 VIRTUAL_DEFAULT = "default"
@@ -33,8 +41,9 @@ def virtual_robot(source: str, *, clock: str | None = None, camera: bool = True)
         clock: "real" or "stepped" for a robot started here; None for what its scenario says.
         camera: False leaves the camera of a robot started here out, for who does not look: it takes long to start.
     """
-    if source != VIRTUAL_DEFAULT and not source.endswith(".toml"):
-        yield _read(Path(source))
+    running = ready_file(source)
+    if running is not None:
+        yield read_ready_file(running)
         return
     if source != VIRTUAL_DEFAULT and not Path(source).is_file():
         remedy = "name a scenario (NAME.toml) or a ready file, or give --virtual alone for a healthy robot"
@@ -53,7 +62,7 @@ def virtual_robot(source: str, *, clock: str | None = None, camera: bool = True)
             )
             try:
                 _await(process, ready, log.name)
-                yield _read(ready)
+                yield read_ready_file(ready)
             finally:
                 process.terminate()
                 assert process.stdin is not None
@@ -138,7 +147,13 @@ def _await(process: subprocess.Popen[bytes], ready: Path, log: str) -> None:
         time.sleep(0.02)
 
 
-def _read(path: Path) -> Mapping[str, str | None]:
+def ready_file(source: str) -> Path | None:
+    """The ready file that a source is; None where a robot is started for it."""
+    return None if source == VIRTUAL_DEFAULT or source.endswith(".toml") else Path(source)
+
+
+def read_ready_file(path: Path) -> Mapping[str, str | None]:
+    """Where a virtual robot that is running listens; raises BadInput."""
     try:
         content = read_json(path, "name what `openant virtual start --ready-file` wrote")
         return {"bus": str(content["bus"]), **{key: content.get(key) for key in ("imu", "camera", "control")}}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import io
 import json
 import os
 import re
@@ -28,6 +29,8 @@ from plants import drive, pendulum, run_of, sweep
 from openant_tools.cli import face, main
 from openant_tools.cli import openant as manual
 from openant_tools.cli.face import CommandFace
+from openant_tools.cli.streams import has_terminal
+from openant_tools.errors import BadInput
 from openant_tools.procedure.step import Ask, Live, Progress
 from openant_tools.recording.tables import write_table
 
@@ -537,3 +540,50 @@ def test_enter_ends_what_is_watched_while_progress_is_told(monkeypatch: pytest.M
     assert shown.answer(watched) is True
     shown.answer(Progress(0.6, "cooling"))
     assert shown.answer(watched) is False
+
+
+# ---- no terminal, and no stream at all ----
+
+
+def without_stdin(*arguments: str | Path, cwd: Path) -> Result:
+    """As `openant … <&-`, a cron job or a service does it."""
+    return subprocess.run(
+        [*OPENANT, *map(str, arguments)], cwd=cwd, text=True, capture_output=True, timeout=PATIENCE_S,
+        preexec_fn=lambda: os.close(0), check=False,
+    )  # fmt: skip
+
+
+def test_a_command_whose_input_is_closed_works_where_it_may_move_and_is_refused_in_one_line_where_not(
+    tmp_path: Path,
+) -> None:
+    scenario = tmp_path / "blind.toml"
+    scenario.write_text('[camera]\npresent = false\n[clock]\nmode = "stepped"\n')
+    record = ("sysid", "record", "--virtual", scenario, "--protocol", "stand", "--seconds", "5", "--out", "run.mcap")
+    assert "and nobody is there to ask → " in refusal(without_stdin(*record, cwd=tmp_path))
+    done = without_stdin(*record, "--yes", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("run")
+    manual_of_all = without_stdin(cwd=tmp_path)
+    assert manual_of_all.returncode == 2
+    assert "Traceback" not in manual_of_all.stderr
+
+
+def test_a_command_ends_as_it_should_where_all_streams_are_closed(tmp_path: Path) -> None:
+    def close() -> None:
+        os.closerange(0, 3)
+
+    for arguments, status in ((("comms", "ports"), 0), (("config", "show", "--robot", "nowhere"), 2)):
+        ended = subprocess.run([*OPENANT, *arguments], cwd=tmp_path, timeout=PATIENCE_S, preexec_fn=close, check=False)
+        assert ended.returncode == status, arguments
+
+
+def test_a_stream_that_is_not_there_is_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("stdin", "stdout", "stderr"):
+        monkeypatch.setattr(sys, name, io.StringIO())
+        getattr(sys, name).close()
+        assert not has_terminal(name)
+        monkeypatch.setattr(sys, name, None)
+        assert not has_terminal(name)
+    assert CommandFace(yes=True).answer(Ask("Which?", default="this one", unit="text")) == "this one"
+    with pytest.raises(BadInput, match="nobody is there to ask"):
+        CommandFace(yes=False).answer(Ask("Which?", unit="text"))

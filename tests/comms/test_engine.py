@@ -281,6 +281,28 @@ def test_a_second_connect_finds_the_port_taken(live: dict[str, str]) -> None:
         EngineProcess(settings)
 
 
+@pytest.mark.parametrize("full", [False, True])
+def test_a_journal_that_cannot_be_written_keeps_the_servos_as_they_were_and_says_so(
+    stepped: dict[str, str], tmp_path: Path, full: bool, capfd: pytest.CaptureFixture[str]
+) -> None:
+    journal = tmp_path / "journal.jsonl"
+    if full:
+        journal.symlink_to("/dev/full")
+    else:
+        journal.mkdir()
+    limit = {"hip_rr": {"temperature_limit": 71}}
+    with pytest.raises(HardwareFault) as refused:
+        EngineProcess(config(stepped, journal=str(journal), registers=limit))
+    why = "No space left on device" if full else "Is a directory"
+    assert str(refused.value) == (
+        f"{journal}: the journal cannot be written ({why}), so temperature_limit of hip_rr was not written to its servo → "
+        "make room there, or make the robot's folder one that can be written to, and try again"
+    )
+    assert "Traceback" not in capfd.readouterr().err
+    with EngineProcess(config(stepped)) as engine:
+        assert engine.description["registers"]["hip_rr"]["temperature_limit"] != 71
+
+
 # ---- guards ------------------------------------------------------------------------------------------------------
 
 
@@ -508,6 +530,15 @@ def alive(pid: int) -> bool:
         return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
     except FileNotFoundError:
         return False
+
+
+def test_who_finds_the_port_taken_is_told_the_program_and_neither_its_engine_nor_the_virtual_robot(
+    live: dict[str, str], moving: tuple[subprocess.Popen[str], dict[str, int], Path]
+) -> None:
+    parent, _, _ = moving
+    with pytest.raises(HardwareFault) as taken:
+        EngineProcess(config(live))
+    assert re.findall(r"process (\d+)", str(taken.value)) == [str(parent.pid)]
 
 
 def test_killing_the_parent_releases_the_robot_and_keeps_the_recording(

@@ -84,6 +84,75 @@ def test_every_way_a_port_does_not_open(host: Host, monkeypatch: pytest.MonkeyPa
     assert "nobody answers there" in explained("socket://localhost:1", errno.ECONNREFUSED, host)
 
 
+def process(host: Host, pid: int, parent: int, *words: str, port: str = "/dev/ttyUSB0") -> None:
+    """One more process on a recorded host; "" for a port that it has not open."""
+    folder = host.proc / str(pid)
+    (folder / "fd").mkdir(parents=True)
+    (folder / "cmdline").write_bytes(b"".join(word.encode() + b"\0" for word in words))
+    (folder / "comm").write_text(f"{Path(words[0]).name[:15]}\n")
+    (folder / "stat").write_text(f"{pid} (a (name) S 1 2) S {parent} 1 1 0\n")
+    if port:
+        (folder / "fd" / "9").symlink_to(port)
+
+
+ENGINE = ("/venv/bin/python3", "-m", "openant_tools.comms.engine", "5", "6")
+ITS_GUARDIAN = ("/venv/bin/python3", "-I", "-S", "/venv/lib/openant_tools/comms/guardian.py", "7", "ff", "0.2")
+
+
+@pytest.mark.parametrize(
+    ("pid", "words", "named"),
+    [
+        (19511, ("/venv/bin/python3", "/venv/bin/openant"), "openant"),
+        (1, ("/venv/bin/python3", "-m", "openant_tools.cli", "sysid", "record", "--yes"), "openant sysid record"),
+        (19511, ("python", "/home/me/walk.py", "openant"), "python /home/me/walk.py openant"),
+    ],
+)
+def test_who_holds_a_port_by_an_engine_is_the_program_that_started_it(
+    host: Host, pid: int, words: tuple[str, ...], named: str
+) -> None:
+    """Even in a container, where that may be process 1."""
+    (host.proc / "4242" / "fd" / "17").unlink()
+    process(host, pid, 0, *words, port="")
+    process(host, 19551, pid, *ENGINE)
+    process(host, 19560, 19551, *ITS_GUARDIAN)
+    said = explained(host.ports()[0].path, errno.EBUSY, host)
+    assert f": it is held by {named} (process {pid}) → close that program first" in said
+
+
+def test_an_engine_whose_program_cannot_be_found_out_is_named_itself(host: Host) -> None:
+    (host.proc / "4242" / "fd" / "17").unlink()
+    process(host, 1, 0, "/sbin/init", port="")
+    process(host, 19551, 1, *ENGINE)  # its program has died
+    process(host, 19561, 0, *ITS_GUARDIAN)  # of a container: its engine is not to be seen
+    said = explained(host.ports()[0].path, errno.EBUSY, host)
+    assert f"{' '.join(ENGINE)} (process 19551), {' '.join(ITS_GUARDIAN)} (process 19561) → " in said
+    (host.proc / "19551" / "fd" / "9").unlink()
+    (host.proc / "19561" / "fd" / "9").unlink()
+    assert "another program holds it → " in explained(host.ports()[0].path, errno.EBUSY, host)
+
+
+def test_the_far_end_of_a_pseudo_terminal_and_that_of_another_container_hold_none(tmp_path: Path) -> None:
+    host = Host(proc=tmp_path / "proc")
+    near, far = os.openpty()
+    try:
+        path = os.ttyname(far)
+        for pid, words in ((31, ("openant", "virtual", "start")), (32, ("minicom",)), (33, ("bash",))):
+            process(host, pid, 1, *words, port="")
+        (host.proc / "31" / "fdinfo").mkdir()
+        (host.proc / "31" / "fdinfo" / "8").write_text(f"pos:\t0\ntty-index:\t{Path(path).name}\n")
+        for pid in (31, 32):
+            (host.proc / str(pid) / "fd" / "9").symlink_to(path)
+        # Of the same name in a /dev/pts of its own, where another device stands.
+        elsewhere = tmp_path / "dev" / "pts"
+        elsewhere.mkdir(parents=True)
+        (elsewhere / Path(path).name).symlink_to("/dev/null")
+        (host.proc / "33" / "fd" / "9").symlink_to(elsewhere / Path(path).name)
+        assert [holder.pid for holder in host.readers(path)] == [32]
+    finally:
+        os.close(near)
+        os.close(far)
+
+
 def test_a_missing_driver_is_named(host: Host) -> None:
     (host.sys / "class" / "tty" / "ttyUSB0").unlink()
     assert "sudo modprobe ftdi_sio" in explained("/dev/ttyUSB9", errno.ENOENT, host)

@@ -49,6 +49,16 @@ def test_what_a_system_may_lack_is_named_in_one_file() -> None:
     assert signals == SIGNALS_IN
 
 
+def test_whether_there_is_a_terminal_is_asked_in_one_place_which_knows_that_a_stream_may_be_closed() -> None:
+    asking = set()
+    for room in ("openant_tools", "openant_env", "openant_agents"):
+        for path in (ROOT / room).rglob("*.py"):
+            nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            if any(isinstance(node, ast.Attribute) and node.attr == "isatty" for node in nodes):
+                asking.add(path.relative_to(ROOT).as_posix())
+    assert asking == {"openant_tools/cli/streams.py"}, "ask `has_terminal`"
+
+
 def test_analysis_and_simulation_need_nothing_that_windows_lacks() -> None:
     lacking = """
 import os, signal, sys

@@ -14,7 +14,7 @@ from textual.containers import Vertical
 from textual.widgets import Input, OptionList, Static
 from textual.widgets.option_list import Option
 
-from openant_tools.errors import OpenAntError
+from openant_tools.errors import OpenAntError, system_faults
 from openant_tools.numbers import number
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.tui.choices import Choices
@@ -100,7 +100,8 @@ that has the columns of docs/recordings.md.
         from openant_tools.recording.tables import read_run  # it loads pyarrow
 
         try:
-            feed = ReplayFeed(read_run(path, need=("pos",)))
+            with system_faults(where=path, again="try again"):
+                feed = ReplayFeed(read_run(path, need=("pos",)))
         except OpenAntError as error:
             self.app.call_from_thread(self.note, str(error))
         else:

@@ -15,7 +15,7 @@ from textual.widgets import Input, OptionList, Static
 from textual.widgets.option_list import Option
 
 from openant_tools.bringup.walk import WALK, Standing, beside, standing
-from openant_tools.errors import OpenAntError
+from openant_tools.errors import OpenAntError, system_faults
 from openant_tools.numbers import exact, number, percent, span
 from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.journal import Journal
@@ -283,7 +283,12 @@ where the number lies. `l` shows the log of what was said and done instead.
     def begin_anew(self) -> None:
         """Run it from its start, whatever of it was done before."""
         if self.session.folder is not None:
-            forget(self.session.folder, self.step.name)
+            try:
+                with system_faults(where=self.session.folder.path, again="try again"):
+                    forget(self.session.folder, self.step.name)
+            except OpenAntError as error:
+                self.say(marked("fail", str(error)))
+                return
         self.begin()
 
     def begin(self) -> None:
