@@ -29,6 +29,7 @@ RECORD_S = 16.0
 #: share of the step that recording takes
 RECORDED = 0.3
 #: what is recorded, in order; the fit, which asks nobody, follows
+REPEATS = "the robot repeats itself too badly → screws, gears, the stand; close what keeps this computer busy, and do it again"
 TAKES = ("the motion to fit", "another to judge by", "the same again", "fit")
 
 
@@ -75,11 +76,15 @@ def identification(bench: Bench) -> Procedure:
     closer = bool(best.accepted)
     shown = bench.folder.path / "fit"
     sysid.report(result, shown, robot=bench.folder.path)
+    disagree = best.before.full <= best.floor
     beside = f", with {' and '.join(sorted({said(name) for name, _ in richer.effects_found}))} added" if richer else ""
     return Finding(
         "identify",
-        False if not closer else None if result.doubt else True,
-        f"error on a motion it has not seen: {number(1e3 * best.before.full, decimals=2)} → {number(best.after.full, 'rad', name='error', decimals=2)}{beside}; "
+        None if result.doubt or disagree else closer,
+        f"two plays of one motion differ by {number(best.floor, 'rad', name='floor', decimals=2)}, more than the nominal model is off "
+        f"({number(best.before.full, 'rad', name='error', decimals=2)}): nothing to judge a fit by"
+        if disagree
+        else f"error on a motion it has not seen: {number(1e3 * best.before.full, decimals=2)} → {number(best.after.full, 'rad', name='error', decimals=2)}{beside}; "
         f"no model could beat {number(best.floor, 'rad', name='floor', decimals=2)}",
         (
             Evidence("error before", best.before.full, "rad", "nominal model, held-out recording, full run"),
@@ -102,8 +107,10 @@ def identification(bench: Bench) -> Procedure:
             "held_out": [bench.folder.relative(take.path) for take in judge],
             "values": {v.name: [v.value, v.low, v.high, v.verdict] for v in best.values},
         },
-        unsure=(result.doubt,) if result.doubt else (),
-        problems=() if closer else ("no fitted value predicts better than the nominal model → it stays in use",),
+        unsure=(result.doubt,) if result.doubt else (REPEATS,) if disagree else (),
+        problems=()
+        if closer or disagree
+        else ("no fitted value predicts better than the nominal model → it stays in use",),
     )
 
 

@@ -56,6 +56,8 @@ LYING_M, STANDING_M = 0.076, 0.148
 SIZE_SHARE = 0.08
 #: A builder places a robot by eye within this.
 BY_EYE_RAD = math.radians(8)
+#: poses of the robot that a phase needs, or nothing is known of it
+LEAST_POSES = 10
 #: Turning to and fro: all hips together, feet on the floor.
 WIGGLE_RAD, WIGGLE_HZ, WIGGLE_S, HOLD_S = 0.35, 0.8, 6.0, 1.5
 #: s; stamps that are as good as this are left as they are
@@ -177,6 +179,8 @@ def arena(bench: Bench) -> Procedure:
         setup = replace(config.camera, body_tag_id=view.body_id, latency_s=None)
         path = bench.folder.new_recording("arena")
         record = yield from _stand_and_wiggle(bench, config, setup, where, view.lens, path)
+        for phase in record.run.facts.extra["phases"]:
+            _between(record, phase)  # or it is no recording to go on from
         parts.done(MOTION, where=where, recording=bench.folder.relative(path), **asdict(view))
     lens, camera_m, origin_id = view.lens, view.camera_m, config.camera.origin_tag_id
     setup = replace(config.camera, body_tag_id=view.body_id)
@@ -495,11 +499,11 @@ def _between(record: Recording, phase: str) -> dict[str, Array]:
     rows = (
         (t >= begin) & (t < end) & np.isfinite([columns[f"base.{name}"] for name in ("x", "y", "z", "yaw")]).all(axis=0)
     )
-    if rows.sum() < 10:
+    if rows.sum() < LEAST_POSES:
         lost = [str(event["reason"]) for event in record.events if event["kind"] == "pose lost"]
         why = f": {max(lost, key=lost.count)}" if lost else ""
         raise HardwareFault(
-            f"the camera gave {int(rows.sum())} poses of the robot while it was {phase}{why}",
+            f"the camera gave {int(rows.sum())} poses of the robot in the phase {phase}, {LEAST_POSES} are needed{why}",
             remedy="light, focus, and both tags in view",
         )
     return {"t": record.pose.t[rows], **{name: columns[f"base.{name}"][rows] for name in ("x", "y", "z", "yaw")}}

@@ -142,7 +142,7 @@ def openant(context: click.Context, robot: Path | None, virtual_source: str | No
     The same, step by step:
       openant virtual start --ready-file robot.json  a virtual Open Ant on pseudo-terminals
       openant sysid record --virtual robot.json --protocol stand --out run.mcap
-      openant sysid fit run.mcap --model ant.xml --out fit
+      openant sysid fit run.mcap --model my-ant/nominal.xml --out fit
       openant train sac --robot my-ant --steps 30000 --out my-ant/runs/sac
     """
     if context.invoked_subcommand is not None:

@@ -59,11 +59,16 @@ def step_options(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _folder_of(robot: Path | None) -> RobotFolder:
     """The robot's folder; made, with the standard kit's nominal values, where it is named and empty."""
+    from openant_tools.cli.log import mention
     from openant_tools.cli.options import robot_folder
     from openant_tools.robot.folder import RobotFolder, create_robot
 
     path = robot_folder(robot, must_exist=robot is None)
-    return create_robot(path) if not (path / "robot.toml").is_file() else RobotFolder.at(path)
+    if (path / "robot.toml").is_file():
+        return RobotFolder.at(path)
+    made = create_robot(path)
+    mention(f"there was no robot in {path}: made {made.config_file} for one (standard kit)")
+    return made
 
 
 @contextlib.contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import select
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import click
 from rich.console import Console
@@ -142,7 +142,7 @@ class CommandFace:
             return ask.choices[0]
         if ask.choices:
             default = ask.default if isinstance(ask.default, str) else ask.choices[0]
-            return Prompt.ask(question, console=self.console, choices=list(ask.choices), default=default)
+            return self._choice(question, ask.choices, default)
         if ask.unit == "text":
             return Prompt.ask(
                 question, console=self.console, default=str(ask.default or ""), show_default=bool(ask.default)
@@ -160,6 +160,18 @@ class CommandFace:
             ):
                 return float(given)
             self._line(f"[red]✗[/red] from {span(ask.low, ask.high, ask.unit)}")
+
+    def _choice(self, question: str, choices: Sequence[str], default: str) -> str:
+        """One of several, or as much of its beginning as no other has."""
+        offered = f"{question} [magenta]{escape('[' + '/'.join(choices) + ']')}[/magenta]"
+        while True:
+            given = Prompt.ask(offered, console=self.console, default=default).strip().lower()
+            meant = [one for one in choices if one.lower() == given] or [
+                one for one in choices if one.lower().startswith(given)
+            ]
+            if len(meant) == 1:
+                return meant[0]
+            self._line(f"[red]✗[/red] one of: {escape(', '.join(choices))}")
 
     def _show(self, live: Live) -> bool:
         """Bars that stay in place on a terminal, nothing where the output goes to a file; whether Enter was pressed since."""

@@ -406,6 +406,11 @@ class OpenAnt(App[int]):
         elif self.session.virtual is None:
             self.need_folder(self._ask_virtual)
         else:
+            words = "End the virtual robot? What it is like is kept where it is this folder's own."
+            self.push_screen(Question(words, "Yes, end it", "No"), self._end_virtual)
+
+    def _end_virtual(self, choice: int | None) -> None:
+        if choice == 0:
             self._in_background("ending the virtual robot", self.session.end_virtual, self.refresh_walk)
 
     def _ask_virtual(self) -> None:

@@ -587,3 +587,17 @@ def test_a_stream_that_is_not_there_is_no_terminal(monkeypatch: pytest.MonkeyPat
     assert CommandFace(yes=True).answer(Ask("Which?", default="this one", unit="text")) == "this one"
     with pytest.raises(BadInput, match="nobody is there to ask"):
         CommandFace(yes=False).answer(Ask("Which?", unit="text"))
+
+
+def test_an_answer_may_be_the_beginning_of_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(face, "need_terminal", lambda why: None)
+    given = iter(["n", "Y", "", "no other"])
+    monkeypatch.setattr("builtins.input", lambda: next(given))
+    shown = CommandFace(yes=False)
+    asked = Ask("Did it turn?", ("yes", "no", "no other"), default="yes")
+    assert [shown.answer(asked) for _ in range(3)] == ["yes", "yes", "no other"], "n is one of two, and asked again"
+    said = capsys.readouterr()
+    assert "[yes/no/no other]" in said.out + said.err
+    assert "one of: yes, no, no other" in said.out + said.err

@@ -453,7 +453,9 @@ def test_a_servo_that_does_not_hear_that_it_is_to_let_go_is_named(live: dict[str
         moving = engine.start(messages.Play(np.repeat(HOME[None, :], 3000, axis=0)))
         control.ask("fault", cause="broken_wire", where=["hip_fl", "knee_fl"], on=True)
         try:
-            with pytest.raises(HardwareFault, match=r"knee_fl.* may still hold: cut the power before you touch the robot"):
+            with pytest.raises(
+                HardwareFault, match=r"knee_fl.* may still hold: cut the power before you touch the robot"
+            ):
                 wait_until(lambda: engine.done(moving))
             assert torques(live)[JOINT_NAMES.index("knee_fl")]
         finally:

@@ -72,7 +72,10 @@ is what the paper's agents reached, once the curve comes near it.
 With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is recorded), *compare* it with the other runs, or
 `d`: have its last recording on the robot *diagnosed*, which says what the simulation lacks.
 """
-    BINDINGS: ClassVar[list[BindingType]] = [Binding("d", "diagnose", "Diagnose")]
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("d", "diagnose", "Diagnose"),
+        Binding("down", "to_choices", show=False),
+    ]
 
     def body(self) -> ComposeResult:
         with Vertical(id="form"):
@@ -88,7 +91,8 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
     def _options(self) -> list[Option]:
         """What can be done now: one thing at a time runs, and the room of the rest is the curve's meanwhile."""
         if self.session.learning:
-            return [Option("Stop and save", id="stop")]
+            trains = isinstance(self.session.training, TrainingProcess)
+            return [Option("Stop and save" if trains else "Stop", id="stop")]
         return [
             Option("A first look, in simulation: 15 minutes, settings that walk sooner", id=FIRST),
             *(Option(f"Train {name} in simulation: {_WORDS[name]}", id=name) for name in AGENTS),
@@ -165,6 +169,10 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         self.session.training = PlayProcess(arguments, folder, where)
         self.session.training.start()
         self.draw_progress()
+
+    def action_to_choices(self) -> None:
+        """From what is typed down to what is chosen."""
+        self.query_one("#choices", Choices).focus()
 
     def action_diagnose(self) -> None:
         """Have the newest recording of a policy diagnosed, on the screen of the gap."""
