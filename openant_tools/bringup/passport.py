@@ -104,7 +104,9 @@ def passport(folder: RobotFolder) -> Report:
             [
                 now.step.title,
                 _STATES[now.state],
-                now.finding.date.strftime("%Y-%m-%d %H:%M") if now.finding else "",
+                f"{now.finding.date:%Y-%m-%d %H:%M}{', virtual robot' if now.finding.virtual else ''}"
+                if now.finding
+                else "",
                 now.finding.what if now.finding else "",
             ]
             for name, now in states.items()

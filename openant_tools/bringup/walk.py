@@ -268,9 +268,15 @@ class Standing:
     left: Unfinished | None = None
 
 
-def standing(folder: RobotFolder) -> dict[str, Standing]:
-    """Every step of the walk, in order, as the robot's `findings/` tell; the walk resumes from it."""
+def standing(folder: RobotFolder, *, real: bool = False) -> dict[str, Standing]:
+    """Every step of the walk, in order, as the robot's `findings/` tell; the walk resumes from it.
+
+    Args:
+        real: whether what was found on a virtual robot counts for nothing.
+    """
     found = {name: latest(folder, name) for name in WALK}
+    if real:
+        found = {name: None if one is not None and one.virtual else one for name, one in found.items()}
     # A passport tells of every step.
     return {
         name: _standing(folder, step, found, tuple(found) if name == "passport" else step.needs)
@@ -325,7 +331,7 @@ def do(step: Step, bench: Bench, face: Face) -> Finding:
         what = f"{error.where}: {error.what}" if error.where else error.what
         command = f"openant calib {step.name}"
         finding = Finding(step.name, False, what, (), error.remedy or "", command, data=data, problems=(what,))
-    keep(finding, bench.folder)
+    keep(finding, bench.folder, virtual=bench.control is not None)
     return finding
 
 
@@ -351,7 +357,7 @@ def walk(
         Declined: an intent was not granted; the walk resumes at that step.
     """
     for name, step in WALK.items():
-        now = standing(bench.folder)[name]
+        now = standing(bench.folder, real=bench.control is None)[name]
         if now.state == "ok" and not again:
             continue
         if now.waits_for:

@@ -66,7 +66,6 @@ def torque_off(port: EnginePort, servos: Servos, notice: Callable[[str], None]) 
     except PortGone:
         port.lose()
         port.holding = True
-    if port.lost:
         return []
     if left:
         notice(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import datetime
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -96,6 +96,7 @@ class Finding:
         date: UTC.
         problems: one line each for what is not as it should be, with the joint and what to do about it.
         unsure: one line each for what could not be judged, and why.
+        virtual: whether it was found on a virtual robot: it says nothing of the real one.
 
     Raises:
         ValueError: it says no, or that it cannot judge, and lists nothing.
@@ -112,6 +113,7 @@ class Finding:
     date: datetime.datetime = field(default_factory=lambda: datetime.datetime.now(datetime.UTC).replace(microsecond=0))
     problems: tuple[str, ...] = ()
     unsure: tuple[str, ...] = ()
+    virtual: bool = False
 
     def __post_init__(self) -> None:
         unknown = tuple(f"{e.name} is not known ({e.source})" for e in self.evidence if e.value is None)
@@ -163,6 +165,7 @@ class Finding:
                 for p in self.parameters
             },
             "data": known(self.data),
+            "virtual": self.virtual,
         }
 
     @classmethod
@@ -186,6 +189,7 @@ class Finding:
             date=datetime.datetime.fromisoformat(str(content["date"])),
             problems=problems,
             unsure=tuple(content.get("unsure", ())),
+            virtual=bool(content.get("virtual", False)),
         )
 
     def as_markdown(self) -> str:
@@ -196,7 +200,13 @@ class Finding:
             lines += ["| what | value | source |", "|---|---|---|"]
             lines += [_row(evidence) for evidence in self.evidence] + [""]
         lines += [f"Next: {self.next_action}", ""] if self.next_action else []
-        return "\n".join([*lines, f"{self.date:%Y-%m-%d %H:%M} UTC, `{self.command}`", ""])
+        return "\n".join(
+            [
+                *lines,
+                f"{self.date:%Y-%m-%d %H:%M} UTC, `{self.command}`{', on a virtual robot' if self.virtual else ''}",
+                "",
+            ]
+        )
 
 
 _SIGNS: Mapping[Verdict, str] = {"ok": "✓", "not ok": "✗", "cannot judge": "?"}
@@ -232,7 +242,7 @@ def latest(folder: RobotFolder, step: str) -> Finding | None:
     return None
 
 
-def keep(finding: Finding, folder: RobotFolder, recording: str | None = None) -> Path:
+def keep(finding: Finding, folder: RobotFolder, recording: str | None = None, *, virtual: bool = False) -> Path:
     """Write a finding into a robot's `findings/`, as JSON and Markdown, and its parameters, below `bench`, into
     `robot.toml`; returns the JSON's path.
 
@@ -245,6 +255,7 @@ def keep(finding: Finding, folder: RobotFolder, recording: str | None = None) ->
     from openant_tools.robot.config import Provenance
 
     folder.refuse_if_held()
+    finding = replace(finding, virtual=virtual)
     if finding.ok:
         forget(folder, finding.step)
     stamp = finding.date.strftime("%Y%m%dT%H%M%SZ")

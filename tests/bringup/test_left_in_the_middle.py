@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,9 +13,11 @@ from builder import Builder, Robot, robot
 
 from openant_tools.bringup.comms_step import comms_step
 from openant_tools.bringup.identification import identification
-from openant_tools.bringup.walk import WALK
+from openant_tools.bringup.passport import write_passport
+from openant_tools.bringup.walk import WALK, standing
 from openant_tools.comms.soak import soaked_seconds
 from openant_tools.errors import HardwareFault
+from openant_tools.procedure.finding import Finding, keep
 from openant_tools.procedure.step import Answer, Ask, Bench, Declined, Event, Intent, Live, Procedure, Progress, Step
 from openant_tools.procedure.unfinished import Unfinished, unfinished
 from openant_tools.recording.reader import read_recording
@@ -22,6 +25,7 @@ from openant_tools.recording.run import Facts
 from openant_tools.recording.telemetry import Cycle, RecordedAnswer, ServoChannel
 from openant_tools.recording.writer import RecordingWriter
 from openant_tools.robot.config import Provenance
+from openant_tools.robot.folder import create_robot
 from openant_tools.sysid.bench.steps import floor_friction
 from openant_tools.thermal.step import thermal_soak
 
@@ -186,3 +190,16 @@ def test_slides_that_were_read_stay_read(tmp_path: Path, monkeypatch: pytest.Mon
     assert "Trial 2 of 3" in builder.said
     assert "Trial 1 of 3" not in builder.said
     assert np.isfinite(finding.parameters[0].value or np.nan)
+
+
+def test_what_was_done_on_a_virtual_robot_is_not_done_on_the_real_one(tmp_path: Path) -> None:
+    folder = create_robot(tmp_path / "my-ant")
+    found = Finding("connect", True, "the bus answers", (), "", "openant calib connect")
+    keep(found, folder, virtual=True)
+    assert standing(folder)["connect"].state == "ok"
+    assert standing(folder, real=True)["connect"].state == "todo"
+    assert "on a virtual robot" in next(folder.findings.glob("connect-*.md")).read_text()
+    assert "virtual robot" in write_passport(folder)[1].read_text()
+    keep(replace(found, date=found.date + datetime.timedelta(seconds=1)), folder)
+    assert standing(folder, real=True)["connect"].state == "ok"
+    assert "virtual robot" not in write_passport(folder)[1].read_text()
