@@ -486,7 +486,7 @@ class _Batch:
         return _Cable(self._batch, self._plant, [cable for _ in self._segments for cable in cables])
 
     def _sample(self, states: _States, out: dict[str, NDArray[np.float32]]) -> None:
-        h = self._plant.timestep
+        h, encoder_late = self._plant.timestep, self._plant.encoder_delay_s
         for s, segment in enumerate(self._segments):
             steps = len(segment.control)
             at = segment.step + segment.fraction
@@ -494,7 +494,7 @@ class _Batch:
                 k = s * self._n + r
                 for name, values in out.items():
                     late = sum(robot.log_delay.get(group, 0.0) for group in LATE_WITH.get(name, (name,)))
-                    late -= 0.0 if name in ("pos", "vel") else self._plant.encoder_delay_s  # which rows come later by
+                    late -= 0.0 if name in ("pos", "vel") else encoder_late  # which rows come later by
                     when = at - late / h
                     found = states.at(name, k, np.clip(when, 0.0, steps), steps, robot)
                     if name == "pos" and late >= h and (before := when < 0).any():

@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 
 import mujoco
@@ -116,7 +116,7 @@ class Plant:
         model.opt.timestep = timestep
         return replace(self, model=model, step_s=self.timestep if self.step_s is None else self.step_s)
 
-    @cached_property
+    @property
     def encoder_delay_s(self) -> float:
         """By how much later than it was a position is said, by sensors `pos.J` with a delay.
 

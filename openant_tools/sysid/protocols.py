@@ -262,10 +262,9 @@ def _filled(name: str, words: str, parts: tuple[Part, ...], seconds: float | Non
     shortest = SHORTEST_S if len(parts) == 1 else max(SHORTEST_S, default / 2)
     if not total >= shortest:
         raise BadInput(
-            f"{exact(total, 's')} is too short for the protocol {name}"
-            + (f", which is {len(parts)} recordings" if len(parts) > 1 else ""),
+            f"{exact(total, 's')} is too short for {name}",
             remedy=f"give it {exact(math.ceil(shortest), 's')} or more"
-            + ("" if len(parts) == 1 else ", or choose one with --protocol, such as stand"),
+            + (f", which its {len(parts)} recordings share, or record one: --protocol stand" if len(parts) > 1 else ""),
         )
     if total > LONGEST_S * len(parts):
         raise BadInput(

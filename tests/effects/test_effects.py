@@ -256,7 +256,7 @@ def test_load_friction_of_another_simulation_is_found_unasked_and_written_beside
         pictures = re.findall(r"\]\((figures/.*?)\)", (folder / "report.md").read_text())
         assert len(pictures) == 3
         assert all((folder / name).stat().st_size for name in pictures)
-    assert "More is explained by what plain MuJoCo has no feature for, load_friction.joint = 0.2" in ran.output
+    assert "More is explained by what plain MuJoCo has no feature for, load friction of joint 0.2" in ran.output
 
     plain, richer = (json.loads((folder / "fit.json").read_text()) for folder in (out, out / "with-effects"))
     assert richer["held_out"]["after"]["gap_full_rad"] < 0.6 * plain["held_out"]["after"]["gap_full_rad"]

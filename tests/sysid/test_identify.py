@@ -682,7 +682,7 @@ def test_halves_of_the_data_that_disagree_raise_an_alarm(model: Path) -> None:
     assert found.halves == (pytest.approx(7.6, rel=0.03), pytest.approx(6.8, rel=0.03))
     assert found.low <= min(found.halves) < max(found.halves) <= found.high
     alarm = next(note for note in torn.notes if "contradict each other about" in note)
-    assert "stiffness.joint (7." in alarm
+    assert "stiffness of joint (7." in alarm
     whole = identify([before.record("a"), before.record("b", seed=1)], model, [before.record("c", seed=2)], kinds=kinds)
     assert all(one.halves is None for one in whole.values)
 
