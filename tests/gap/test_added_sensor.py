@@ -29,7 +29,7 @@ def test_a_current_that_is_logged_hurts_nothing() -> None:
         (robots,) = (judged(place) for place in TRAINING.glob(f"*/{path.name}") if place != path)
         kept = json.loads(path.read_text())
         pairs += [(robots[int(n)], without(robots[int(n)], one)) for n, one in kept.items() if one is not None]
-    assert len(pairs) >= 46
+    assert len(pairs) >= 60
     both = [(right(with_it), right(without_it), with_it) for with_it, without_it in pairs]
     for group in (
         lambda one: True,
