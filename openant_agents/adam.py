@@ -67,5 +67,6 @@ class Adam:
             for name, tensor in (("step", self._counts[k]), ("exp_avg", mean), ("exp_avg_sq", self._squares[k])):
                 new = kept[k][name] if kept else torch.zeros_like(tensor)
                 if new.shape != tensor.shape:
-                    raise ValueError(f"{name} has another shape than the parameter that it belongs to")
+                    there, here = (" × ".join(map(str, one.shape)) for one in (new, tensor))
+                    raise ValueError(f"{name} has shape {there}, not {here}")
                 tensor.copy_(new)

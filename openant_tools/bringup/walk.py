@@ -331,7 +331,7 @@ def do(step: Step, bench: Bench, face: Face) -> Finding:
         what = f"{error.where}: {error.what}" if error.where else error.what
         command = f"openant calib {step.name}"
         finding = Finding(step.name, False, what, (), error.remedy or "", command, data=data, problems=(what,))
-    keep(finding, bench.folder, virtual=bench.control is not None)
+    keep(finding, bench.folder, virtual=bench.virtual)
     return finding
 
 
@@ -357,7 +357,7 @@ def walk(
         Declined: an intent was not granted; the walk resumes at that step.
     """
     for name, step in WALK.items():
-        now = standing(bench.folder, real=bench.control is None)[name]
+        now = standing(bench.folder, real=not bench.virtual)[name]
         if now.state == "ok" and not again:
             continue
         if now.waits_for:

@@ -63,7 +63,7 @@ def connect(bench: Bench, host: Host | None = None) -> Procedure:
     if camera == "":
         yield Say("no camera is named yet; the Arena step asks for it", "info")
 
-    if bench.control is None:
+    if not bench.virtual:
         # A virtual robot's ports are gone with it: they are named on the command line, not kept.
         kept: dict[str, str] = {"ports.bus": bus} | ({"ports.imu": imu} if imu else {})
         bench.folder.update(kept, provenance=Provenance("found", COMMAND, None))

@@ -104,7 +104,7 @@ def run_and_keep(procedure: Procedure, bench: Bench, face: Any) -> Finding:
     from openant_tools.procedure.step import drive
 
     finding = drive(procedure, face)
-    keep(finding, bench.folder, virtual=bench.control is not None)
+    keep(finding, bench.folder, virtual=bench.virtual)
     return finding
 
 

@@ -213,7 +213,7 @@ def scale(
         from openant_tools.sysid.bench.report import stiffness_report
 
         write_report(stiffness_report(finding), report, [readings] if readings else ())
-    return _conclude(finding, folder if robot is not None else None, json_file)
+    return _conclude(finding, folder if robot is not None else None, json_file, virtual=virtual_source is not None)
 
 
 @click.command(cls=Moving)
@@ -297,7 +297,7 @@ def tilt(
             finding = drive(procedure, face)
     else:
         finding = friction_finding(slopes, _command(), source="protractor", resolution_rad=resolution, slid=not held)
-    return _conclude(finding, folder if robot is not None else None, json_file)
+    return _conclude(finding, folder if robot is not None else None, json_file, virtual=virtual_source is not None)
 
 
 @contextlib.contextmanager
@@ -320,7 +320,7 @@ def _command() -> str:
     return "openant sysid " + str(click.get_current_context().info_name)
 
 
-def _conclude(finding: Finding, folder: RobotFolder | None, json_file: Path | None) -> int:
+def _conclude(finding: Finding, folder: RobotFolder | None, json_file: Path | None, *, virtual: bool = False) -> int:
     """Print what was found, write it where it belongs, and say by the exit code whether it is well."""
     from openant_tools.cli.calib import show_finding
     from openant_tools.cli.face import echo_numbers
@@ -328,5 +328,5 @@ def _conclude(finding: Finding, folder: RobotFolder | None, json_file: Path | No
 
     echo_numbers(finding)
     if folder is not None:
-        mention(f"wrote {keep(finding, folder)}")
+        mention(f"wrote {keep(finding, folder, virtual=virtual)}")
     return show_finding(finding, json_file)

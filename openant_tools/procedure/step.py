@@ -248,6 +248,11 @@ class Bench:
     control: str | None = None
     joints: tuple[str, ...] = ()
 
+    @property
+    def virtual(self) -> bool:
+        """Whether it is a virtual robot, of which nothing that is found says anything of the real one."""
+        return self.control is not None
+
 
 @dataclass(frozen=True)
 class Step:

@@ -110,7 +110,7 @@ class StepRun:
                 finding = drive(self.step.start(self._bench), self)
                 if self._ended is not None:  # what was stopped has seen less than it says
                     raise self._ended
-                keep(finding, self._bench.folder, virtual=self._bench.control is not None)
+                keep(finding, self._bench.folder, virtual=self._bench.virtual)
         except (OpenAntError, OSError) as error:
             # Of what was ended from here that is the reason, whatever broke off by it.
             self._done(None, str(self._ended or _ours(error, self._bench.folder.path)))

@@ -196,6 +196,8 @@ def test_what_was_done_on_a_virtual_robot_is_not_done_on_the_real_one(tmp_path: 
     folder = create_robot(tmp_path / "my-ant")
     found = Finding("connect", True, "the bus answers", (), "", "openant calib connect")
     keep(found, folder, virtual=True)
+    assert Bench(folder, control="control").virtual
+    assert not Bench(folder, bus="/dev/ttyUSB0").virtual
     assert standing(folder)["connect"].state == "ok"
     assert standing(folder, real=True)["connect"].state == "todo"
     assert "on a virtual robot" in next(folder.findings.glob("connect-*.md")).read_text()
