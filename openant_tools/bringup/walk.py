@@ -373,4 +373,5 @@ def walk(
         if cause is not None and not RULES[StopCause(cause)].faces:
             face.answer(Say("motion has ended for good: look at the robot, then begin the walk again", "fail"))
             break
-    return {name: now.finding for name, now in standing(bench.folder).items() if now.finding is not None}
+    states = standing(bench.folder, real=not bench.virtual)
+    return {name: now.finding for name, now in states.items() if now.finding is not None}

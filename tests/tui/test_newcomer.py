@@ -80,6 +80,7 @@ def test_an_evaluation_shows_its_progress_and_then_its_figures_below_the_curve(
     curve = "".join(f"{n * 100},{n * 12},{0.001 * n}\n" for n in range(40))
     (run / "learning_curve.csv").write_text(f"step,seconds,average_reward_m_s\n{curve}")
     figures = (
+        "openant: my-ant was never identified: this is the kit's nominal model, not that robot (`openant sysid fit`)\n"
         "sampled, as in training: +3.9 cm/s over 120 s, median of 15 starts (+2.1 to +4.4); 4.61 m walked, 3 turns\n"
         "likeliest action, without chance: +1.2 cm/s over 120 s, median of 15 starts (+0.0 to +4.0); stood still for good "
         "in 4 of 15; 1.40 m walked, 1 turns\npolicy of step 3900\n"
@@ -146,6 +147,9 @@ def test_a_joint_that_falls_silent_keeps_its_last_values_and_says_since_when() -
     assert "silent 20 s" in row_of(history, "knee_rl")
     assert "+18.8°     - −0.16  38 11.8" in row_of(history, "knee_rl")
     assert "✓ ok" in row_of(history, "hip_rr")
+    then, now = (JointTable(history)._joint(joint) for joint in ("knee_rl", "hip_rr"))
+    assert [str(span.style) for span in then.spans].count("dim") == 2, "the angle, and what stands after it"
+    assert "dim" not in [str(span.style) for span in now.spans]
 
 
 def test_what_nobody_reads_any_more_is_dimmed_and_says_how_long_ago_it_was(robot: RobotFolder) -> None:  # noqa: F811

@@ -298,6 +298,8 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         text.truncate(max(width, len(text.plain.partition("   ")[0])), overflow=overflow())
         text.append("\n")
         said = playing.said if code in (None, 0) else []
+        # Before what the command has to remark.
+        said.sort(key=lambda words: words.startswith("openant: "))
         lines = [line for words in said for line in textwrap.wrap(spelled(words), width)]
         # The figures come first; the curve has what they leave of the room, and in a small window the last words go.
         if curve_so_far(playing.folder):
