@@ -48,12 +48,12 @@ def condition(history: History, joint: str) -> Condition:
 def _condition(history: History, joint: str) -> Condition:
     if joint not in history.joints or not len(history.rows):
         known = np.isfinite(history.last_known(f"pos.{joint}"))
-        return Condition("off", "last read", since="last read") if known else Condition("todo", "no data")
+        return Condition("off", "old", since="last read") if known else Condition("todo", "no data")
     quiet_s = history.quiet_s
     if history.live and not history.over and quiet_s >= QUIET_S:
-        return Condition("warn", "not read", since=f"unread {_ago(quiet_s)}")
+        return Condition("warn", "unread", since=f"unread {_ago(quiet_s)}")
     if history.over or quiet_s >= QUIET_S:
-        return Condition("off", "last read", since=f"{_ago(quiet_s)} ago" if quiet_s >= QUIET_S else "last read")
+        return Condition("off", "old", since=f"{_ago(quiet_s)} ago" if quiet_s >= QUIET_S else "last read")
     code = history.newest(f"err.{joint}")
     word = ERR_CODES[int(code)] if np.isfinite(code) and 0 <= code < len(ERR_CODES) else ""
     if word == "alert":

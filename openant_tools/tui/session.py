@@ -315,6 +315,8 @@ class Session:
             ended = True
         if ended:
             self.faults.note("", "the engine has ended; torque is off")
+            with contextlib.suppress(HardwareFault):
+                engine.close()  # or it would be followed for ever, and nobody could watch anew
             self._engine = None
 
     @property

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -19,7 +20,7 @@ from openant_tools.bringup.walk import BESIDE, WALK
 from openant_tools.comms.ring import columns
 from openant_tools.procedure.finding import Finding, keep
 from openant_tools.recording.tables import write_table
-from openant_tools.robot.folder import RobotFolder
+from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui.app import SCREENS, OpenAnt
 from openant_tools.tui.choices import Choices
@@ -134,6 +135,14 @@ def row_of(history: History, joint: str) -> str:
     return JointTable(history)._joint(joint).plain
 
 
+def test_servos_that_are_no_joints_yet_have_rows_of_their_own() -> None:
+    history = History(("id 10", "id 11"))
+    history.read({"id 10": 0.1, "id 11": 0.2}, 0.0)
+    lines = JointTable(history)._table().plain.splitlines()
+    assert [line[:8].strip() for line in lines] == ["joint", "id 10", "id 11"]
+    assert "+5.7°" in lines[1]
+
+
 def test_a_joint_that_falls_silent_keeps_its_last_values_and_says_since_when() -> None:
     history = held()
     names = columns(JOINT_NAMES)
@@ -179,6 +188,30 @@ def test_what_nobody_reads_any_more_is_dimmed_and_says_how_long_ago_it_was(robot
         assert condition(app.session.history, "hip_rr").word == "ok", "a replay that stands is not stale"
 
     with_program(robot.path, look)
+
+
+def test_when_the_engine_dies_its_last_values_stay_and_one_can_watch_anew(tmp_path: Path) -> None:
+    scenario = tmp_path / "blind.toml"
+    scenario.write_text("[camera]\npresent = false\n")
+
+    async def watch() -> None:
+        app = OpenAnt(create_robot(tmp_path / "my-ant").path, virtual=str(scenario))
+        async with app.run_test(size=(120, 40)) as pilot:
+            await until(pilot, lambda: app.session.virtual is not None and not app.session.doing)
+            await pilot.press("c")
+            await until(pilot, lambda: len(app.session.history.rows) > 20)
+            engine = app.session._engine
+            assert engine is not None
+            os.kill(engine.pid, signal.SIGKILL)
+            await until(pilot, lambda: app.session.feed is None)
+            assert any("the engine has ended" in fault.words for fault in app.session.faults.unseen)
+            await until(pilot, lambda: " s ago" in condition(app.session.history, "hip_rr").since)
+            assert np.isfinite(app.session.history.last_known("temp.hip_rr"))
+            await pilot.press("escape", "c")
+            await until(pilot, lambda: condition(app.session.history, "hip_rr").word == "ok")
+        app.session.close()
+
+    asyncio.run(watch())
 
 
 # ---- the gap ----
