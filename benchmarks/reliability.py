@@ -64,12 +64,21 @@ def page(results: dict[str, Any]) -> str:
         "<!-- made by `python benchmarks/reliability.py --write` -->",
         "Each attack is made again and again on the virtual robot, on fake servos or on files; `python benchmarks/reliability.py`",
         "makes more tries and adds them. What happens on a fault, one by one, stands in [the bus](comms.md#what-stops-a-motion).",
+        "",
+        "| what is attacked | attacks | tries | survived |",
+        "|---|---|---|---|",
     ]
+    for part, title in TITLES.items():
+        counts = [(row["tries"], row["survived"]) for row in results.get(part, {}).values()]
+        if counts:
+            tries, survived = map(sum, zip(*counts, strict=True))
+            lines.append(f"| {title} | {len(counts)} | {tries} | {survived} |")
+    lines += ["", "## Reference"]
     for part, title in TITLES.items():
         rows = results.get(part, {})
         if not rows:
             continue
-        lines += ["", f"## {title}", ""]
+        lines += ["", f"### {title}", ""]
         if part == SPOILT:
             lines += [
                 "Two scenarios and two blind verdicts were not survived at first: mended, and those files tried again.",

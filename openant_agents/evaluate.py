@@ -147,7 +147,8 @@ def evaluate(
 
     def played(start: int) -> PolicyPlay:
         def tell(done: float, average: float) -> None:
-            words = f"{way} {number(100 * average, 'cm/s', sign=True, decimals=1)}"
+            achieved = number(100 * average, "cm/s", sign=True, decimals=1)
+            words = f"start {start + 1} of {starts}, {way} {achieved}"
             progress((start + done / seconds) / starts, words)
 
         with in_time_with(env):

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-__all__ = ["PROGRESS", "end_with", "end_with_who_started_us", "environment", "pass_on", "tied"]
+__all__ = ["PROGRESS", "end_with", "end_with_who_started_us", "environment", "pass_on", "passed_on", "tied"]
 
 #: s between two looks, and what a command has to save and to let go in
 LOOK_S = 0.5
@@ -80,6 +80,15 @@ def pass_on(share: float, words: str) -> None:
     if fd is not None:
         with contextlib.suppress(OSError):  # nobody listens any more
             os.write(fd, f"{share:.4f} {words}\n".encode())  # for a file
+
+
+def passed_on(line: str) -> tuple[float, str] | None:
+    """What `pass_on` said in a line: the share from 0 to 1, and words; None where it is no such line."""
+    share, _, words = line.rstrip("\n").partition(" ")
+    try:
+        return float(share), words
+    except ValueError:
+        return None
 
 
 @functools.cache

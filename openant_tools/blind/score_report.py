@@ -224,16 +224,16 @@ def write_docs(found: Score, path: Path) -> None:
         "# The blind benchmark", "",
         "<!-- Written by `openant gap blind score SET… --docs docs/blind.md`: do not edit. -->", "",
         "Robots that nobody chose, simulated by other code than the diagnosis uses, judged before the answers are opened.", "",
-        "```sh elsewhere", *_COMMANDS, "```", "", *_drawn(found), "", *_HOW, "", "## Result", "", _origin(found), "", *table_lines(found), "",
+        "```sh elsewhere", *_COMMANDS, "```", "", *_drawn(found), "", "## Result", "", _origin(found), "", *table_lines(found), "",
     ]  # fmt: skip
     if worst:
         lines += ["Commonest confusions: " + "; ".join(f"{a} taken for {b} ({n})" for a, b, n in worst) + ".", ""]
     lines += [
         f"![Truth against verdict]({relative}/blind-confusion.png)", "",
         f"![Stated probability against frequency]({relative}/blind-reliability.png)", "",
-        "## Every failure", "", "| robot | truth | verdict | ranked |", "|---|---|---|---|",
+        "## Reference", "", *_HOW, "", "### Every failure", "", "| robot | truth | verdict | ranked |", "|---|---|---|---|",
         *(f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in _failures(found)), "",
-        *_makers(), "## Sizes", "", "Drawn evenly between the two figures of each size. " + _SCOPES, "", size_table(), "",
+        *_makers(), "### Sizes", "", "Drawn evenly between the two figures of each size. " + _SCOPES, "", size_table(), "",
     ]  # fmt: skip
     write_text(path, "\n".join(lines))
 
@@ -245,6 +245,8 @@ _COMMANDS = (
 )
 _SCOPES = "Scopes: one joint (j), the servos of one model (g), all joints (a), the body (b)."
 _HOW = (
+    "### How it is done",
+    "",
     "**What they do.** Three runs on the stand and four on the floor of about 9 s each, one table of commands for all, 50 rows a",
     "second; the last run of either is held out. Rows scatter by up to 0.6 ms, stamps by up to 0.3 ms.",
     "",
@@ -275,7 +277,7 @@ def _makers() -> list[str]:
     example = answer_for(Answer("single", (drawn,), 1630172453, "", True), "robot-003", Path("/home/me/SET/model.xml"))
     strange = ", ".join(f"`{name}` ({words})" for name, words in {**OUTSIDE, **ELSEWHERE}.items())
     return [
-        "## Makers", "",
+        "### Makers", "",
         "`openant gap blind make --maker COMMAND` lets any program make the robots, so that the diagnosis meets simulators that its",
         "authors did not write. `benchmarks/second_generator` is one, in Drake. For each robot COMMAND is called once, without a shell:",
         "", "```sh elsewhere", "COMMAND ANSWER.json FOLDER", "```", "",

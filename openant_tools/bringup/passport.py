@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from openant_tools.bringup.robot_picture import robot_picture
 from openant_tools.bringup.tracking import Moment, draw_moment, worst_moment
-from openant_tools.bringup.walk import WALK, standing
+from openant_tools.bringup.walk import WALK, Standing, standing
 from openant_tools.errors import BadInput
 from openant_tools.numbers import column, number, span
 from openant_tools.procedure.finding import Evidence, Finding
@@ -38,9 +39,9 @@ _STATES = {
 def passport_step(bench: Bench) -> Procedure:
     """Write the passport of the robot as it stands."""
     yield Progress(None, "writing the passport")
-    paths = write_passport(bench.folder)
-    states = standing(bench.folder)
-    done = [name for name, now in states.items() if now.state == "ok" and name != "passport"]
+    paths = write_passport(bench.folder, real=not bench.virtual)
+    states = standing(bench.folder, real=not bench.virtual)
+    done = _done(states)
     missing = [
         WALK[name].title
         for name, now in states.items()
@@ -49,8 +50,8 @@ def passport_step(bench: Bench) -> Procedure:
     return Finding(
         "passport",
         True,
-        f"{paths[0].name} and {paths[1].name}: {len(done)} of {len(WALK) - 1} steps say yes",
-        (Evidence("steps that say yes", float(len(done)), "", "findings/"),),
+        f"{paths[0].name} and {paths[1].name}: {done} of {len(WALK)} steps say yes, this one included",
+        (Evidence("steps that say yes", float(done), "", "findings/, and this passport"),),
         f"openant train sac --robot {bench.folder.path} --out {bench.folder.runs / 'sac-1'}"
         if not missing
         else f"still to do: {', '.join(missing)}",
@@ -59,17 +60,30 @@ def passport_step(bench: Bench) -> Procedure:
     )
 
 
-def write_passport(folder: RobotFolder) -> tuple[Path, Path]:
-    """Write passport.html and passport.md; both paths."""
-    report = passport(folder)
+def _done(states: Mapping[str, Standing]) -> int:
+    """How many steps say yes, as the walk counts them once there is the passport that is being written."""
+    return sum(now.state == "ok" or name == "passport" for name, now in states.items())
+
+
+def write_passport(folder: RobotFolder, *, real: bool = True) -> tuple[Path, Path]:
+    """Write passport.html and passport.md; both paths.
+
+    Args:
+        real: whether steps that were done on a virtual robot count for nothing.
+    """
+    report = passport(folder, real=real)
     return report.write(folder.passport), report.write_markdown(folder.passport.with_suffix(".md"))
 
 
-def passport(folder: RobotFolder) -> Report:
-    """The passport as a report."""
+def passport(folder: RobotFolder, *, real: bool = True) -> Report:
+    """The passport as a report.
+
+    Args:
+        real: whether steps that were done on a virtual robot count for nothing.
+    """
     config = folder.config()
-    states = standing(folder)
-    done = [name for name, now in states.items() if now.state == "ok" and name != "passport"]
+    states = standing(folder, real=real)
+    done = _done(states)
     open_ = [now.step.title for name, now in states.items() if now.state != "ok" and name != "passport"]
     failed = any(now.state == "failed" for now in states.values())
     problems = [
@@ -81,9 +95,9 @@ def passport(folder: RobotFolder) -> Report:
     left = ", ".join(open_[:4]) + (f" and {len(open_) - 4} more" if len(open_) > 4 else "")
     train = f"openant train sac --robot {folder.path} --out {folder.runs / 'sac-1'}"
     answer = ReportSummary(
-        f"{config.name} is measured and calibrated: all {len(done)} steps say yes."
+        f"{config.name} is measured and calibrated: all {done} steps say yes."
         if not open_
-        else f"{len(done)} of {len(WALK) - 1} steps of {config.name} say yes; left: {left}.",
+        else f"{done} of {len(WALK)} steps of {config.name} say yes; left: {left}.",
         _portrait(folder),
         f"Simulated and real robot read this folder: `{config.model}` is the model, `robot.toml` the rest."
         + ("\n\n" + "\n".join(problems) if problems else ""),
@@ -103,7 +117,7 @@ def passport(folder: RobotFolder) -> Report:
         [
             [
                 now.step.title,
-                _STATES[now.state],
+                Mark("done on a virtual robot") if now.virtual else _STATES[now.state],
                 f"{now.finding.date:%Y-%m-%d %H:%M}{', virtual robot' if now.finding.virtual else ''}"
                 if now.finding
                 else "",

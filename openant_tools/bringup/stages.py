@@ -6,7 +6,6 @@ changed. So whatever was interrupted or killed goes on where it stopped.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shlex
 import shutil
@@ -22,7 +21,7 @@ from typing import IO, ClassVar
 from openant_tools.errors import BadInput, OpenAntError
 from openant_tools.files import json_text, read_json, write_text
 from openant_tools.procedure.relay import part_of
-from openant_tools.workers import PROGRESS, environment
+from openant_tools.workers import PROGRESS, environment, passed_on
 
 __all__ = ["Stage", "StageFailed", "StagedFolder", "openant", "remove", "words_of"]
 
@@ -197,9 +196,9 @@ def _hear(told: int, progress: Callable[[float, str], None]) -> None:
     """What `workers.pass_on` says in the command, until it has ended."""
     with open(told, encoding="utf-8", errors="replace") as lines:
         for line in lines:
-            share, _, words = line.rstrip("\n").partition(" ")
-            with contextlib.suppress(ValueError):
-                progress(float(share), words)
+            told_now = passed_on(line)
+            if told_now is not None:
+                progress(*told_now)
 
 
 def _older(results: Sequence[Path], inputs: Sequence[Path]) -> bool:

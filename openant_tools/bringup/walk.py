@@ -259,6 +259,7 @@ class Standing:
         state: `stale` where a step that it needs has been done again since.
         waits_for: steps that it needs and that have not said yes yet.
         left: how far it was when it was left in the middle; None where it was not.
+        virtual: whether it said yes on a virtual robot, where that counts for nothing.
     """
 
     step: Step
@@ -266,6 +267,7 @@ class Standing:
     state: State
     waits_for: tuple[str, ...]
     left: Unfinished | None = None
+    virtual: bool = False
 
 
 def standing(folder: RobotFolder, *, real: bool = False) -> dict[str, Standing]:
@@ -274,9 +276,7 @@ def standing(folder: RobotFolder, *, real: bool = False) -> dict[str, Standing]:
     Args:
         real: whether what was found on a virtual robot counts for nothing.
     """
-    found = {name: latest(folder, name) for name in WALK}
-    if real:
-        found = {name: None if one is not None and one.virtual else one for name, one in found.items()}
+    found = {name: latest(folder, name, real=real) for name in WALK}
     # A passport tells of every step.
     return {
         name: _standing(folder, step, found, tuple(found) if name == "passport" else step.needs)
@@ -284,9 +284,9 @@ def standing(folder: RobotFolder, *, real: bool = False) -> dict[str, Standing]:
     }
 
 
-def beside(folder: RobotFolder, step: Step) -> Standing:
+def beside(folder: RobotFolder, step: Step, *, real: bool = False) -> Standing:
     """The same of a step that has no place in the order."""
-    found = {one: latest(folder, one) for one in (*step.needs, step.name)}
+    found = {one: latest(folder, one, real=real) for one in (*step.needs, step.name)}
     return _standing(folder, step, found, ())  # each is a measurement by itself: no other makes it stale
 
 
@@ -300,7 +300,9 @@ def _standing(folder: RobotFolder, step: Step, found: Mapping[str, Finding | Non
         if not finding.ok:
             state = "unsure" if finding.ok is None else "failed"
     waits = tuple(name for name in step.needs if (seen := found[name]) is None or not seen.ok)
-    return Standing(step, finding, state, waits, unfinished(folder, step.name))
+    passed_over = latest(folder, step.name) if finding is None else None
+    virtual = passed_over is not None and bool(passed_over.ok)
+    return Standing(step, finding, state, waits, unfinished(folder, step.name), virtual)
 
 
 def step(name: str) -> Step:
@@ -371,4 +373,5 @@ def walk(
         if cause is not None and not RULES[StopCause(cause)].faces:
             face.answer(Say("motion has ended for good: look at the robot, then begin the walk again", "fail"))
             break
-    return {name: now.finding for name, now in standing(bench.folder).items() if now.finding is not None}
+    states = standing(bench.folder, real=not bench.virtual)
+    return {name: now.finding for name, now in states.items() if now.finding is not None}

@@ -88,7 +88,7 @@ def bringup(
                 echo_finding(found)
 
         walk(bench, face, again=again, notice=notice)
-        states = standing(folder)
+        states = standing(folder, real=not bench.virtual)
     red = [name for name, now in states.items() if now.state != "ok"]
     result: dict[str, Any] = {
         "ok": not red,

@@ -34,12 +34,20 @@ words from (`python -m openant_tools.comms.troubleshooting`); the examples speak
 
 In doubt about these tools? `openant comms scan --driver sdk`, `openant comms watch --driver sdk` and `openant calib inventory
 --driver sdk` ask with the vendor's own DynamixelSDK: where it meets the same silence, the bus or the servo is silent.
+
+- [A servo, or the whole bus, is silent](#a-servo-or-the-whole-bus-is-silent)
+- [Answers are lost now and then](#answers-are-lost-now-and-then)
+- [A servo has switched itself off](#a-servo-has-switched-itself-off): its LED blinks
+- [A servo says no](#a-servo-says-no)
+- [A port does not open](#a-port-does-not-open)
+
+## Reference
 """
-_SILENCE = """## A servo, or the whole bus, is silent
+_SILENCE = """### A servo, or the whole bus, is silent
 
 In this order: the cable is named only when all before it was excluded. Nothing is written while asking.
 """
-_LOST = """## Answers are lost now and then
+_LOST = """### Answers are lost now and then
 
 What `openant comms diagnose` tells apart in recordings and soaks. A loss in a cycle in which this computer was late counts
 against the computer, never against a cable.
@@ -57,12 +65,12 @@ def page() -> str:
             ("cause", "it says", "do", "to make sure"),
             ((f"`{name}`", cause.words, cause.remedy, cause.test) for name, cause in CAUSES.items()),
         ),
-        "## A servo has switched itself off\n\nIts LED blinks, and torque cannot be switched on. `openant comms scan` shows "
+        "### A servo has switched itself off\n\nIts LED blinks, and torque cannot be switched on. `openant comms scan` shows "
         "it, `openant comms reboot` says which error it is, and refuses while its cause stands.\n",
         _table(("error", "what it means, and what to do"), ((one.name, one.advice) for one in HARDWARE_ERRORS)),
-        "## A servo says no\n",
+        "### A servo says no\n",
         _table(("it refuses because", "do"), REFUSALS.values()),
-        "## A port does not open\n",
+        "### A port does not open\n",
         _table(("you see", "it says", "it means", "do"), (_row(one, _CLOSED) for one in PORT.values())),
     ]
     return "\n".join(parts)

@@ -60,7 +60,7 @@ class Diagnosis:
         effects: every one considered, best first.
         selected: those that go into the improved model, first the one whose removal costs most.
         ambiguous_with: sets that these runs cannot tell apart.
-        gap: "before", "after", "floor" in rad, "signals" besides.
+        gap: "before", "after", "floor" in rad, "floor_from" ("repeats" of the same commands or "sensors"), "signals" besides.
         where: shares of the excess, largest first, with what the improved model leaves there, if there is one.
         rest: what that leaves, and what it follows (`gap.residual.Residual`); empty where nothing was fitted.
         calibration: kind → joint → factor or amount that the re-fit within tolerance found, for the improved model.

@@ -106,6 +106,7 @@ def finding(trials: Trials, given: Given, tried: Tried, decision: Decision, chos
             "before": plain.before,
             "after": plain.before if best is None or not chosen else best.after,
             "floor": plain.floor,
+            "floor_from": "repeats" if predictions.from_repeats else "sensors",
             "signals": measured.as_json()["signals"],
         },
         where=where,

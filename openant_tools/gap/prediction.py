@@ -52,7 +52,8 @@ class Predictions:
         names: what of the model may move within tolerance. sensed: signals of the body that any run has, of the others.
         measured: of each run, (rows, channels); NaN where nobody knows what a servo had in mind (`around_switching`).
         form: what simulations are like in what no model says; forms: what it may be: dry friction holds, or gives before it slides.
-        there: of each run, (rows,) which of them are simulated. floor: (joints,) rad; sigma: (channels,) of sensors.
+        there: of each run, (rows,) which of them are simulated. floor: (joints,) rad, and whether it comes from repeats
+            of the same commands (`from_repeats`), else from the sensors; sigma: (channels,) of sensors.
     """
 
     def __init__(self, protocol: RunSet, without: Collection[str] = ()) -> None:
@@ -75,7 +76,7 @@ class Predictions:
         self._coarse = protocol.coarse(STAND_STEP_S).runs
         self._sets: dict[tuple[int, ...], list[tuple[tuple[int, ...], Rollouts]]] = {}
         self.measured = [self._measured(one) for one in protocol.runs]
-        self.floor = floors([one.run for one in protocol.runs], protocol.joints)[0]
+        self.floor, self.from_repeats = floors([one.run for one in protocol.runs], protocol.joints)
         self.sigma = np.concatenate(
             [
                 np.maximum(self.floor, LEAST_SIGMA_RAD),

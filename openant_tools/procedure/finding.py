@@ -227,17 +227,20 @@ def _entry(evidence: Evidence) -> dict[str, Any]:
     return {name: value for name, value in vars(evidence).items() if value is not None or name not in ("least", "most")}
 
 
-def latest(folder: RobotFolder, step: str) -> Finding | None:
+def latest(folder: RobotFolder, step: str, *, real: bool = False) -> Finding | None:
     """The newest finding of a step in a robot's `findings/`, or None where it has not been done.
 
     A file that cannot be read counts as none: the step is then done again.
+
+    Args:
+        real: whether what was found on a virtual robot is passed over.
     """
     for path in sorted(folder.findings.glob(f"{step}-2*.json"), reverse=True):
         try:
             finding = Finding.of_json(read_json(path))
         except (OSError, BadInput, ValueError, KeyError, TypeError, AttributeError):
             continue
-        if finding.step == step:
+        if finding.step == step and not (real and finding.virtual):
             return finding
     return None
 

@@ -510,10 +510,10 @@ def _seen(
 
 def _marks(rate_k_min: float, current_a: float, load: float, volts: float) -> str:
     """What stands beside a temperature: how fast it rises, how hard the servo works, its supply."""
-    effort, unit = (load, "") if math.isnan(current_a) else (current_a, " A")
     said = (
         (rate_k_min, number(rate_k_min, "K/min", sign=True, decimals=1)),
-        (effort, f"{number(effort, sign=True, decimals=2)}{unit}"),
+        (current_a, f"{number(current_a, sign=True, decimals=2)} A"),
+        (load, f"load {number(load, 'share', sign=True, decimals=0)}"),
         (volts, number(volts, "V", decimals=1)),
     )
     return ", ".join(words for value, words in said if math.isfinite(value))

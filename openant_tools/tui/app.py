@@ -13,7 +13,7 @@ from types import FrameType
 from typing import ClassVar
 
 from rich.text import Text
-from textual import work
+from textual import events, work
 from textual.app import App, SystemCommand
 from textual.binding import Binding, BindingType
 from textual.screen import Screen
@@ -30,7 +30,7 @@ from openant_tools.tui.dialogs import Help, Question
 from openant_tools.tui.feeds import ReplayFeed
 from openant_tools.tui.jump import Jump
 from openant_tools.tui.marks import BLUE, GREEN, ORANGE, VERMILION, plain
-from openant_tools.tui.page import Page, help_of
+from openant_tools.tui.page import LEAST, ROOMY, Page, help_of, too_small
 from openant_tools.tui.screens.findings import FindingsScreen
 from openant_tools.tui.screens.gap import GapScreen
 from openant_tools.tui.screens.learn import LearnScreen
@@ -50,6 +50,8 @@ TICK_S = 0.1
 END_S = 10.0
 
 INTERRUPTED = 130
+#: what acts where the window is too small to see what anything else would do: stop, quit, suspend
+UNSEEN_KEYS = {"space", "ctrl+c", "ctrl+z"}
 _log = logging.getLogger(__name__)
 #: the folder that is offered where there is none
 NEW_ROBOT = "my-ant"
@@ -128,6 +130,9 @@ class OpenAnt(App[int]):
         Binding("greater_than_sign", "speed(2)", show=False),
         Binding("x", "end_replay", show=False),
     ]
+    #: from which size on a screen uses the room beside and below
+    HORIZONTAL_BREAKPOINTS = [(0, "-small"), (LEAST[0], "-narrow"), (ROOMY[0], "-wide")]  # noqa: RUF012
+    VERTICAL_BREAKPOINTS = [(0, "-low"), (LEAST[1], "-short"), (ROOMY[1], "-tall")]  # noqa: RUF012
 
     def __init__(
         self, path: Path, *, virtual: str | None = None, clock: str | None = "real", ticking: bool = True
@@ -176,6 +181,12 @@ class OpenAnt(App[int]):
         if self.session.feed is not None or before is not None or self._running_step:
             self.screen.draw()
 
+    async def on_event(self, event: events.Event) -> None:
+        """Let no key act on what a window that is too small does not show."""
+        typed = event.key not in UNSEEN_KEYS if isinstance(event, events.Key) else isinstance(event, events.Paste)
+        if not (typed and too_small(self.size)):
+            await super().on_event(event)
+
     # ---- stop ----------------------------------------------------------------------------------------------------
 
     def action_stop(self) -> None:
@@ -184,7 +195,7 @@ class OpenAnt(App[int]):
         for screen in self.screen_stack:
             if isinstance(screen, StepScreen):
                 screen.stopped()
-        if isinstance(self.focused, Input):
+        if isinstance(self.focused, Input) and not too_small(self.size):
             self.focused.insert_text_at_cursor(" ")
             if not told:
                 return
@@ -324,7 +335,7 @@ class OpenAnt(App[int]):
         else:
             words = f"All that is found out about a robot is kept in a folder. There is none here yet: make {place}?"
             offers = [f"Yes: {kit.words}" for kit in kits]
-        self.push_screen(Question(words, *offers, "Another place, or one that is there already: Settings"), answered)
+        self.push_screen(Question(words, *offers, "Another place, or one that is there already: Setup"), answered)
 
     def open_step(self, name: str, *, instead: bool = False) -> None:
         """Open a step of the walk, on top or instead of the screen that is open."""
@@ -366,8 +377,8 @@ class OpenAnt(App[int]):
         # What the screen is for comes before how its lists are gone through.
         own = "\n".join(words for widget in reversed([*self._focus_path()]) if (words := help_of(widget)))
         # A question is about the page below it.
-        about = next((screen.about for screen in reversed(self.screen_stack) if isinstance(screen, Page)), "")
-        self.push_screen(Help(f"{about}\n{own}\n{GENERAL_HELP}"))
+        about = next(screen for screen in reversed(self.screen_stack) if isinstance(screen, Page))
+        self.push_screen(Help(f"{about.about}\n{own}\n{GENERAL_HELP}", about.doc))
 
     def _focus_path(self) -> Iterable[Widget]:
         widget: Widget | None = self.focused

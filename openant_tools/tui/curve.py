@@ -47,7 +47,9 @@ def curve_lines(step: Array, reward: Array, stop: float, level: float | None, wi
     ascii_only = plain()
     wall, corner, floor, dots = ("|", "+", "-", ".") if ascii_only else ("│", "└", "─", "┄")
     across = max(width - SCALE - 1, 10)
-    drawn = trace(step, reward, 0.0, stop, low, high, across, height, plain=ascii_only)
+    # A young curve has fewer points than the picture columns: lines lead from one to the next.
+    between = np.union1d(step, np.linspace(step[0], step[-1], 2 * across))
+    drawn = trace(between, np.interp(between, step, reward), 0.0, stop, low, high, across, height, plain=ascii_only)
 
     def row(value: float) -> int:
         return min(max(int((high - value) / (high - low) * height), 0), height - 1)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from openant_tools.comms.guards import Guards
 from openant_tools.comms.ring import ERR_CODES
+from openant_tools.numbers import number
 from openant_tools.tui.feeds import History
 from openant_tools.tui.marks import Name
 
@@ -15,16 +17,24 @@ __all__ = ["Condition", "FaultList", "ShownFault", "condition"]
 
 #: the engine's own idea of a servo that is lost
 SILENT_S = Guards().silent_s or 0.25
+#: s without a row from which on what stands on the screen is not of now
+QUIET_S = 1.0
 BUS = "bus"
 
 
 @dataclass(frozen=True)
 class Condition:
-    """How one joint is, as a mark and a word; `fault` where somebody should know even when it is over."""
+    """How one joint is, as a mark and a word.
+
+    Attributes:
+        fault: where somebody should know even when it is over.
+        since: the word with its time, where the last values of the joint are not of now.
+    """
 
     mark: Name
     word: str
     fault: str = ""
+    since: str = ""
 
 
 def condition(history: History, joint: str) -> Condition:
@@ -36,25 +46,34 @@ def condition(history: History, joint: str) -> Condition:
 
 
 def _condition(history: History, joint: str) -> Condition:
-    if not len(history.rows):
-        return Condition("todo", "no data")
-    if history.over:
-        return Condition("off", "last read")
-    answered = history.column(f"ok.{joint}") > 0
+    if joint not in history.joints or not len(history.rows):
+        known = np.isfinite(history.last_known(f"pos.{joint}"))
+        return Condition("off", "old", since="last read") if known else Condition("todo", "no data")
+    quiet_s = history.quiet_s
+    if history.live and not history.over and quiet_s >= QUIET_S:
+        return Condition("warn", "unread", since=f"unread {_ago(quiet_s)}")
+    if history.over or quiet_s >= QUIET_S:
+        return Condition("off", "old", since=f"{_ago(quiet_s)} ago" if quiet_s >= QUIET_S else "last read")
     code = history.newest(f"err.{joint}")
     word = ERR_CODES[int(code)] if np.isfinite(code) and 0 <= code < len(ERR_CODES) else ""
     if word == "alert":
         return Condition("fail", "alert", "reports a hardware error: `openant comms reboot` says which")
-    if not answered[-1]:
-        last = history.t[answered][-1] if answered.any() else history.t[0]
-        silent = float(history.t[-1] - last)
+    if not history.newest(f"ok.{joint}") > 0:
+        silent = history.silent_s(joint)
         if silent >= SILENT_S:
-            return Condition("fail", "silent", f"does not answer ({word or 'no word'}): `openant comms scan`")
+            since = f"silent {_ago(silent)}" if silent >= QUIET_S else "silent"
+            return Condition("fail", "silent", f"does not answer ({word or 'no word'}): `openant comms scan`", since)
         return Condition("warn", word or "late")
     outside = history.outside(f"pos.{joint}") or history.outside(f"vel.{joint}")
     if outside:
         return Condition("warn", "outside", outside)
     return Condition("ok", "ok")
+
+
+def _ago(seconds: float) -> str:
+    """A time in the past in whole seconds or minutes."""
+    minutes = seconds >= 60.0
+    return number(math.floor(seconds / 60 if minutes else seconds), "min" if minutes else "s", decimals=0)
 
 
 @dataclass(frozen=True)

@@ -127,14 +127,33 @@ class History:
         t: (n,) s. rows: (n, columns).
         bounds: name of a column → measured (low, high) of it, for what is observed (`[observation]` of robot.toml).
         over: whether nobody reads any more: what stands here was read last.
+        live: whether rows should come by themselves.
+
+    Args:
+        before: the history of the same robot until now: its last values stand until there are new ones.
     """
 
-    def __init__(self, joints: Sequence[str], bounds: Mapping[str, tuple[float, float]] | None = None) -> None:
+    def __init__(
+        self,
+        joints: Sequence[str],
+        bounds: Mapping[str, tuple[float, float]] | None = None,
+        *,
+        live: bool = False,
+        before: History | None = None,
+    ) -> None:
         self.joints = tuple(joints)
         self.over = False
+        self.live = live
         self.bounds = dict(bounds or {})
         self._index = {name: k for k, name in enumerate(columns(joints))}
+        self._ok = np.array([self._index[f"ok.{joint}"] for joint in self.joints], int)
         self.rows: Array = np.empty((0, len(self._index)))
+        #: the last value of each column that was a number; s of the last answer of each joint, in the rows' time
+        self._known = np.full(len(self._index), np.nan)
+        self._answered = np.full(len(self.joints), np.nan)
+        self._before: Mapping[str, float] = {} if before is None else before.all_known()
+        #: s since a row came
+        self.quiet_s = 0.0
         #: what others have worked out of these rows, by joint; gone with the next rows
         self.worked_out: dict[str, Any] = {}
 
@@ -145,8 +164,30 @@ class History:
     def add(self, rows: Array) -> None:
         if len(rows):
             self.worked_out.clear()
+            known = np.isfinite(rows)
+            last = len(rows) - 1 - known[::-1].argmax(axis=0)
+            self._known = np.where(known.any(axis=0), rows[last, np.arange(rows.shape[1])], self._known)
+            # Of a joint that has not answered yet, since the first row.
+            self._answered = np.where(np.isnan(self._answered), rows[0, 0], self._answered)
+            answered = rows[:, self._ok] > 0
+            last = len(rows) - 1 - answered[::-1].argmax(axis=0)
+            self._answered = np.where(answered.any(axis=0), rows[last, 0], self._answered)
             self.rows = np.concatenate([self.rows, rows])
             self.rows = self.rows[np.searchsorted(self.t, self.t[-1] - WINDOW_S) :]
+
+    def wait(self, quiet_s: float) -> None:
+        """Take in that no row came for so many s."""
+        if int(quiet_s) != int(self.quiet_s):
+            self.worked_out.clear()
+        self.quiet_s = quiet_s
+
+    def silent_s(self, joint: str) -> float:
+        """How long a joint has not answered, in s, however long that is."""
+        return float(self.t[-1] - self._answered[self.joints.index(joint)]) if len(self.rows) else 0.0
+
+    def all_known(self) -> dict[str, float]:
+        """Column → its last value, of this robot's earlier rows, too."""
+        return {**self._before, **{name: value for name in self._index if (value := self.last_known(name)) == value}}
 
     def read(self, angles_rad: Mapping[str, float], t: float) -> None:
         """Take in what a procedure has read of all its joints by itself, torque off."""
@@ -157,16 +198,17 @@ class History:
 
     def left(self) -> History:
         """What was read last, torque off, once who read it has ended."""
-        out = History(self.joints)
+        out = History(self.joints, before=self)
         out.over = True
         if len(self.rows):
             row = np.array([[self.last_known(name) for name in self._index]])
             row[0, self._index["torque"]] = 0.0
-            out.rows = row
+            out.add(row)
         return out
 
     def clear(self) -> None:
         self.rows = self.rows[:0]
+        self._known[:] = self._answered[:] = np.nan
         self.worked_out.clear()
 
     def column(self, name: str) -> Array:
@@ -189,13 +231,9 @@ class History:
         return f"{name} is {number(value, unit)}, outside its bounds {span(low, high, unit)}"
 
     def last_known(self, name: str) -> float:
-        """The last value that is a number, of those in the window; NaN where there is none."""
-        newest = self.newest(name)
-        if newest == newest:  # not NaN
-            return newest
-        values = self.column(name)
-        known = values[np.isfinite(values)]
-        return float(known[-1]) if len(known) else float("nan")
+        """The last value that was a number, however long ago; NaN where there was none."""
+        known = float(self._known[self._index[name]]) if name in self._index else float("nan")
+        return known if known == known else self._before.get(name, float("nan"))
 
 
 def _table(run: Run) -> Array:

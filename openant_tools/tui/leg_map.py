@@ -153,8 +153,7 @@ Arrow keys choose a joint, here and among the strips.
         return angle if np.isfinite(angle) else 0.0
 
     def _condition(self, joint: str) -> Condition:
-        known = joint in self._history.joints
-        return condition(self._history, joint) if known else Condition("todo", "no data")
+        return condition(self._history, joint)
 
     def _with_marks(
         self, lines: list[list[str]], points: dict[str, tuple[int, int]], feet: dict[str, tuple[int, int]]
@@ -184,7 +183,7 @@ Arrow keys choose a joint, here and among the strips.
             return text
         found = self._condition(self.chosen)
         text.append(f"{self.chosen} ", "bold")
-        text.append(f"{mark(found.mark)} {found.word}", MARKS[found.mark].colour)
+        text.append(f"{mark(found.mark)} {spelled(found.since or found.word)}", MARKS[found.mark].colour)
         if self.chosen in self._history.joints:
             angle = self._history.last_known(f"pos.{self.chosen}")
             if np.isfinite(angle):

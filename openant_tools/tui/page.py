@@ -10,6 +10,7 @@ from rich.text import Text
 from textual import events
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
+from textual.geometry import Size
 from textual.screen import Screen
 from textual.widget import Widget
 from textual.widgets import Footer, Input, OptionList, Static
@@ -22,7 +23,7 @@ from openant_tools.tui.marks import MARKS, mark, marked, overflow, plain, spelle
 from openant_tools.tui.session import Session
 from openant_tools.tui.strips import JointStrips
 
-__all__ = ["Page", "Program", "help_of", "put"]
+__all__ = ["LEAST", "ROOMY", "Page", "Program", "help_of", "put", "too_small"]
 
 #: columns and lines that every screen needs
 LEAST = (80, 24)
@@ -75,17 +76,16 @@ class Page(Screen[None]):
     Attributes:
         TITLE: in the top line.
         HELP: what F1 shows where the focused widget has nothing of its own to say.
+        DOC: the page of docs/ that says more, which F1 links.
     """
 
     TITLE = ""
     HELP = ""
+    DOC = "tour.md"
     BINDINGS: ClassVar[list[BindingType]] = [Binding("escape", "app.back", "Back")]
 
-    def __init__(self) -> None:
-        super().__init__()
-        # From which size on a screen uses the room beside and below.
-        self.HORIZONTAL_BREAKPOINTS = [(0, "-small"), (LEAST[0], "-narrow"), (ROOMY[0], "-wide")]
-        self.VERTICAL_BREAKPOINTS = [(0, "-low"), (LEAST[1], "-short"), (ROOMY[1], "-tall")]
+    #: what had the focus before the window was too small
+    _focused_before: Widget | None = None
 
     @property
     def ant(self) -> Program:
@@ -101,6 +101,11 @@ class Page(Screen[None]):
         return ""
 
     @property
+    def doc(self) -> str:
+        """The page of docs/ on what is at hand now."""
+        return self.DOC
+
+    @property
     def verdict(self) -> Text:
         """What has to be seen whatever the size of the window."""
         return Text()
@@ -108,7 +113,7 @@ class Page(Screen[None]):
     @property
     def small(self) -> bool:
         """Whether the window has no room for the screen."""
-        return self.size.width < LEAST[0] or self.size.height < LEAST[1]
+        return too_small(self.size)
 
     @property
     def roomy(self) -> bool:
@@ -134,6 +139,12 @@ class Page(Screen[None]):
         self.draw()
 
     def on_resize(self) -> None:
+        # What a small window hides loses the focus, and has it again with room again.
+        if self.small and self._focused_before is None:
+            self._focused_before = self.focused
+        elif not self.small and self._focused_before is not None:
+            self.call_after_refresh(self.set_focus, self._focused_before)
+            self._focused_before = None
         if self.query("#top"):  # the first comes before there is anything to draw
             self.draw()
 
@@ -145,7 +156,9 @@ class Page(Screen[None]):
         put(self.query_one("#top", Static), self._top())
         if self.small:
             least = f"Make the window larger: {LEAST[0]} columns and {LEAST[1]} lines at least."
-            put(self.query_one("#small", Static), Text("\n").join([self.verdict, Text(least, style="bold")]))
+            keys = "Until then only Space (stop), Ctrl-C (quit) and Ctrl-Z (suspend) act."
+            lines = [self.verdict, Text(least, style="bold"), Text(keys)]
+            put(self.query_one("#small", Static), Text("\n").join(lines))
         faults = session.faults.unseen
         bar = self.query_one("#faults", Static)
         bar.display = bool(faults)
@@ -184,7 +197,7 @@ class Page(Screen[None]):
             text.append(f"  {mark('info')} virtual robot")
         else:
             text.append(f"  {mark('off')} not connected")
-        if session.feed is not None and len(session.history.rows):
+        if len(session.history.rows) and not session.history.over:
             on = session.history.newest("torque") > 0
             text.append("  ")
             text.append_text(marked("on" if on else "off", "torque ON" if on else "torque off"))
@@ -211,6 +224,11 @@ class Page(Screen[None]):
     def on_joint_chosen(self, message: JointChosen) -> None:
         self.session.selected = message.joint
         self.draw()
+
+
+def too_small(size: Size) -> bool:
+    """Whether a window has no room for a screen."""
+    return size.width < LEAST[0] or size.height < LEAST[1]
 
 
 def put(place: Static, words: Text) -> None:

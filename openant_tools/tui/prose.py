@@ -22,7 +22,7 @@ class Prose(Vertical):
 
     def compose(self) -> ComposeResult:
         # Bullets and the rules of tables are drawn with signs that ASCII has not; Markdown reads well as it is.
-        yield Static(spelled(self._words), markup=False) if plain() else Markdown(self._words)
+        yield Static(spelled(self._words), markup=False) if plain() else Markdown(self._words, open_links=False)
 
     def show(self, words: str) -> None:
         self._words = words

@@ -8,6 +8,9 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from openant_tools.bringup.walk import standing
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.messages import EngineConfig, Notice, Stopped
@@ -26,6 +29,8 @@ from openant_tools.tui.training import PlayProcess, TrainingProcess
 from openant_tools.virtual.process import VIRTUAL_DEFAULT, read_ready_file, ready_file, virtual_robot
 
 __all__ = ["Session"]
+
+Array = NDArray[np.float64]
 
 
 class Session:
@@ -55,6 +60,8 @@ class Session:
         self.training: TrainingProcess | PlayProcess | None = None
         self.diagnosing: Process | None = None
         self._engine: EngineProcess | None = None
+        #: s, when the last row came
+        self._heard = 0.0
         #: of a virtual robot that somebody else started, and may start anew
         self._ready_file: Path | None = None
         self._virtual_process = contextlib.ExitStack()
@@ -113,9 +120,7 @@ class Session:
             raise BadInput(f"not yet: {self.doing}", where=self.path, remedy="begin once that is done")
         folder = self.folder
         if folder is None:
-            raise BadInput(
-                "there is no robot.toml here", where=self.path, remedy="make a robot's folder: Settings, key s"
-            )
+            raise BadInput("there is no robot.toml here", where=self.path, remedy="make a robot's folder: Setup, key s")
         if self.virtual is None:
             return Bench(folder)
         self._find_virtual()
@@ -137,6 +142,7 @@ class Session:
             self._disconnect()
             self._virtual_process.close()
             self.virtual = self._ready_file = None
+            self.history = History(self.history.joints)  # what was read there is not of another robot
             folder = self.folder
             if source is None and folder is not None:
                 from openant_tools.bringup.persistent_robot import persistent_robot  # it loads MuJoCo
@@ -160,6 +166,7 @@ class Session:
             self._disconnect()
             self._virtual_process.close()
             self.virtual = self._ready_file = None
+            self.history = History(self.history.joints)  # what was read there is not of another robot
 
     # ---- watching it ---------------------------------------------------------------------------------------------
 
@@ -238,11 +245,20 @@ class Session:
             if self.replay is not None and self.replay.jumped:
                 self.history.clear()
                 self.replay.jumped = False
-            self.history.add(rows)
+            self._take(rows)
             if self.replay is None:
                 self.faults.watch(self.history)
+        elif len(self.history.rows):
+            self._take(())
         if self._engine is not None:
             self._hear(self._engine)
+
+    def _take(self, rows: Array | tuple[()]) -> None:
+        """Add rows to the history; where none came, so many seconds it has been."""
+        if len(rows):
+            self.history.add(np.asarray(rows))
+            self._heard = time.monotonic()
+        self.history.wait(0.0 if self.replay is not None else time.monotonic() - self._heard)
 
     def _follow_engines(self) -> None:
         """Show the engine that runs, be it ours or one that a procedure has started."""
@@ -261,14 +277,18 @@ class Session:
         if self.feed is not None or not angles_rad:
             return
         if self.history.over or set(self.history.joints) != set(angles_rad):
-            self.history = History(tuple(angles_rad))
-        self.history.read(angles_rad, time.monotonic())
+            self.history = History(tuple(angles_rad), before=self.history)
+        self._heard = time.monotonic()
+        self.history.read(angles_rad, self._heard)
+        self.history.wait(0.0)
 
     def _show(self, feed: Feed | None) -> None:
         if self.feed is not None:
             self.feed.close()
+        before = None if self.replay is not None or isinstance(feed, ReplayFeed) else self.history
         self.feed = feed
-        self.history = History(JOINT_NAMES if feed is None else feed.joints, self._bounds())
+        live, joints = isinstance(feed, LiveFeed), JOINT_NAMES if feed is None else feed.joints
+        self.history = History(joints, self._bounds(), live=live, before=before)
 
     def _bounds(self) -> Mapping[str, tuple[float, float]]:
         """Between what this robot's observations were measured, while it is watched or replayed.
@@ -295,6 +315,8 @@ class Session:
             ended = True
         if ended:
             self.faults.note("", "the engine has ended; torque is off")
+            with contextlib.suppress(HardwareFault):
+                engine.close()  # or it would be followed for ever, and nobody could watch anew
             self._engine = None
 
     @property

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from openant_tools.procedure.step import Step
 
-__all__ = ["step_help"]
+__all__ = ["step_doc", "step_help"]
 
 #: name → (what it is for, its words, what goes wrong and how that looks, its page)
 _HELP: Mapping[str, tuple[str, str, str, str]] = {
@@ -171,6 +171,11 @@ _HELP: Mapping[str, tuple[str, str, str, str]] = {
 
 
 def step_help(step: Step) -> str:
-    """A page of Markdown on a step."""
-    why, words, wrong, page = _HELP[step.name]
-    return f"# {step.title}\n\n{why}\n\n{words}\n\n**What goes wrong:** {wrong}\n\nMore: `docs/{page}`\n"
+    """What F1 says of a step; Markdown."""
+    why, words, wrong, _ = _HELP[step.name]
+    return f"# {step.title}\n\n{why}\n\n{words}\n\n**What goes wrong:** {wrong}\n"
+
+
+def step_doc(step: Step) -> str:
+    """The page of docs/ on a step."""
+    return _HELP[step.name][3]

@@ -32,13 +32,13 @@ class Signal:
     """One thing that can be shown of every joint.
 
     Attributes:
-        columns: of the rows; the first that has values counts.
+        column: of the rows.
         low, high: what the strip spans at least.
         decimals: of the number beside it, which has a sign unless it cannot be negative.
     """
 
     title: str
-    columns: tuple[str, ...]
+    column: str
     unit: str
     low: float
     high: float
@@ -46,16 +46,17 @@ class Signal:
 
 
 SIGNALS: tuple[Signal, ...] = (
-    Signal("angle", ("pos",), "°", -30.0, 30.0, 1),
-    Signal("velocity", ("vel",), "°/s", -60.0, 60.0, 0),
-    Signal("effort (A, or share of full load)", ("cur", "load"), "", -0.2, 0.2, 2),
-    Signal("duty", ("pwm",), "%", -20.0, 20.0, 0),
-    Signal("supply", ("volt",), "V", 9.0, 13.0, 1),
-    Signal("temperature", ("temp",), "°C", 20.0, 60.0, 0),
-    Signal("round trip", ("rtt",), "ms", 0.0, 5.0, 2),
+    Signal("angle", "pos", "°", -30.0, 30.0, 1),
+    Signal("velocity", "vel", "°/s", -60.0, 60.0, 0),
+    Signal("current", "cur", "A", -0.2, 0.2, 2),
+    Signal("load", "load", "%", -20.0, 20.0, 0),
+    Signal("duty", "pwm", "%", -20.0, 20.0, 0),
+    Signal("supply", "volt", "V", 9.0, 13.0, 1),
+    Signal("temperature", "temp", "°C", 20.0, 60.0, 0),
+    Signal("round trip", "rtt", "ms", 0.0, 5.0, 2),
 )
 #: columns → factor from the row's unit to the one shown
-_FACTOR: Mapping[str, float] = {"rtt": 1e3, "pwm": 100.0, "pos": math.degrees(1), "vel": math.degrees(1)}
+_FACTOR: Mapping[str, float] = {"rtt": 1e3, "pwm": 100.0, "load": 100.0, "pos": math.degrees(1), "vel": math.degrees(1)}
 #: columns of text before and after the trace
 _BEFORE, _AFTER = 25, 17
 #: of one joint: each line costs time ten times a second
@@ -75,7 +76,7 @@ A gap in a trace is a time without an answer; nothing is drawn that was not meas
 
 | key | |
 |---|---|
-| `←` `→` | another signal: angle, velocity, effort, duty, supply, temperature, round trip |
+| `←` `→` | another signal: angle, velocity, current, load, duty, supply, temperature, round trip |
 | `↑` `↓` | choose a joint, here and on the map of the robot |
 
 All strips of a signal share one scale, which stands in the top line; it grows when a value leaves it.
@@ -200,11 +201,7 @@ All strips of a signal share one scale, which stands in the top line; it grows w
         return lines
 
     def _values(self, joint: str, chosen: Signal) -> np.ndarray:
-        for name in chosen.columns:
-            values = self._history.column(f"{name}.{joint}")
-            if np.isfinite(values).any():
-                return values * _FACTOR.get(name, 1.0)
-        return np.full(len(self._history.rows), np.nan)
+        return self._history.column(f"{chosen.column}.{joint}") * _FACTOR.get(chosen.column, 1.0)
 
     def _body(self, width: int) -> str:
         """One line on the torso: turn rate, specific force, place; empty where nobody measures them."""

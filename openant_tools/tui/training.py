@@ -15,8 +15,6 @@ __all__ = ["AGENTS", "Place", "PlayProcess", "TrainingProcess", "curve_so_far"]
 
 #: where it walks; what is not `sim` moves a robot, and the stop key reaches it
 Place = Literal["sim", "robot", "virtual"]
-#: last lines of what a command said
-SAID = 6
 #: agents that this version has
 AGENTS: tuple[str, ...] = tuple(
     name for name in ("sac", "sarsa") if importlib.util.find_spec(f"openant_agents.{name}") is not None
@@ -55,19 +53,16 @@ class TrainingProcess(Process):
 
 
 class PlayProcess(Process):
-    """What is done with trained agents: evaluated, played, compared."""
+    """What is done with trained agents: evaluated, played, compared.
+
+    Attributes:
+        folder: the run's, or that of all runs.
+    """
 
     def __init__(self, arguments: tuple[str, ...], folder: Path, where: Place = "sim") -> None:
         super().__init__(arguments, folder / f"{arguments[0]}.log")
+        self.folder = folder
         self.where = where
-
-    @property
-    def said(self) -> list[str]:
-        """Its last lines."""
-        try:
-            return self.log.read_text(encoding="utf-8", errors="replace").splitlines()[-SAID:]
-        except OSError:
-            return []
 
 
 def curve_so_far(folder: Path) -> list[CurvePoint]:

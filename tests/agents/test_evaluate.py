@@ -69,7 +69,7 @@ def test_a_gait_that_lives_on_chance_walks_sampled_and_stands_still_as_its_likel
     assert 0.0 < sampled.low < sampled.median < sampled.high < 0.06
     assert sampled.mean == pytest.approx(np.mean([play.progress_m / 20.0 for play in sampled.plays]))
     assert told[-1][0] == pytest.approx(1.0)
-    assert re.fullmatch(r"likeliest \S+ cm/s", told[-1][1])
+    assert re.fullmatch(r"start 5 of 5, likeliest \S+ cm/s", told[-1][1])
 
 
 def test_the_play_that_is_filmed_is_the_play_that_was_measured():

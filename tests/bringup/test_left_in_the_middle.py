@@ -14,7 +14,8 @@ from builder import Builder, Robot, robot
 from openant_tools.bringup.comms_step import comms_step
 from openant_tools.bringup.identification import identification
 from openant_tools.bringup.passport import write_passport
-from openant_tools.bringup.walk import WALK, standing
+from openant_tools.bringup.walk import WALK, do, standing
+from openant_tools.cli.face import CommandFace
 from openant_tools.comms.soak import soaked_seconds
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.finding import Finding, keep
@@ -205,3 +206,21 @@ def test_what_was_done_on_a_virtual_robot_is_not_done_on_the_real_one(tmp_path: 
     keep(replace(found, date=found.date + datetime.timedelta(seconds=1)), folder)
     assert standing(folder, real=True)["connect"].state == "ok"
     assert "virtual robot" not in write_passport(folder)[1].read_text()
+
+
+def test_walk_and_passport_count_the_same_steps_and_a_virtual_trial_takes_nothing_back(tmp_path: Path) -> None:
+    folder = create_robot(tmp_path / "my-ant")
+    then, later = datetime.datetime(2026, 11, 20, 9, 30, tzinfo=datetime.UTC), datetime.timedelta(seconds=1)
+    found = Finding("connect", True, "the bus answers", (), "", "openant calib connect", date=then)
+    keep(found, folder)
+    keep(replace(found, date=found.date + later), folder, virtual=True)
+    keep(replace(found, step="estop", date=found.date + 2 * later), folder, virtual=True)
+    for bench, steps in ((Bench(folder), 2), (Bench(folder, control="control"), 3)):
+        passport = do(WALK["passport"], bench, CommandFace(yes=True))
+        counted = sum(one.state == "ok" for one in standing(folder, real=not bench.virtual).values())
+        assert counted == steps
+        assert f"{counted} of {len(WALK)} steps" in passport.what
+        assert f"{counted} of {len(WALK)} steps" in folder.passport.with_suffix(".md").read_text()
+    real = standing(folder, real=True)
+    assert (real["connect"].state, real["connect"].virtual) == ("ok", False), "found on the robot itself before"
+    assert (real["estop"].state, real["estop"].virtual) == ("todo", True)

@@ -190,14 +190,9 @@ def test_every_link_leads_somewhere(page: str) -> None:
 
 #: lines of Markdown that a browser shows at once, about
 SCREEN = 60
-#: pages to look things up in, and worked examples, which are read from their beginning to their end
-LOOKED_UP = {
-    "architecture", "bench", "benchmarks", "blind", "dynamixel", "effects", "first-robot", "new-effect", "python", "reliability", "so101",
-    "troubleshooting",
-}  # fmt: skip
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES[1:] if Path(page).stem not in LOOKED_UP])
+@pytest.mark.parametrize("page", PAGES[1:])
 def test_a_page_fits_a_screen_before_its_reference(page: str) -> None:
     shown = (ROOT / page).read_text(encoding="utf-8").partition("\n## Reference\n")[0]
     assert shown.count("\n") <= SCREEN, f"{page}: its first part has {shown.count(chr(10))} lines"

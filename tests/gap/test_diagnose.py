@@ -71,6 +71,7 @@ def test_late_commands_are_named_and_close_the_gap(late: Diagnosis) -> None:
     assert names & {"action_delay", "sensor_delay"}
     assert found.verdict != NONE
     assert found.gap["before"] > 3 * found.gap["floor"]
+    assert found.gap["floor_from"] == "sensors", "nobody repeated a motion"
     assert found.gap["after"] < 0.5 * found.gap["before"]
     assert {one["signal"]: one["finding"] for one in found.sensors}["pos"] == "as_modelled"
     assert sum(place["share"] for place in found.where if place["signal"] == "pos") == pytest.approx(1, abs=0.01)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import signal
 import time
 import tomllib
@@ -519,6 +520,9 @@ def test_the_walks_step_soaks_fits_and_finds(tmp_path: Path) -> None:
     assert finding.ok, finding.problems
     assert any(one.name == "knee_fl holds for ever" for one in finding.evidence)
     assert "hold the home pose for 2 min" in builder.said
+    seen = [event.marks for event in builder.events if isinstance(event, Live) and event.marks][-1]
+    assert re.search(r"(?<!load )[+−]\d\.\d\d A, \d+\.\d V$", seen["knee_fl"]), "a servo that measures its current"
+    assert re.search(r"load [+−]\d+ %, \d+\.\d V$", seen["hip_fl"]), "one that does not"
     (recording,) = (tmp_path / "ant" / "recordings").iterdir()
     assert finding.data["recording"] == f"recordings/{recording.name}"
 

@@ -153,9 +153,7 @@ def held() -> History:
         values |= {f"temp.{joint}": 31.0 + k}
         values |= {f"cur.{joint}": 0.125 - 0.041 * k} if "knee" in joint else {f"load.{joint}": 0.12 + 0.01 * k}
     history = History(JOINT_NAMES)
-    history.rows = np.column_stack(
-        [np.broadcast_to(values.get(name, np.nan), t.shape) for name in columns(JOINT_NAMES)]
-    )
+    history.add(np.column_stack([np.broadcast_to(values.get(name, np.nan), t.shape) for name in columns(JOINT_NAMES)]))
     return history
 
 
@@ -257,6 +255,7 @@ def worked(robot: RobotFolder, monkeypatch: pytest.MonkeyPatch) -> Run:  # noqa:
     run = a_worked_folder(robot, monkeypatch)
     monkeypatch.setattr(leg_map, "REST_S", BRIEF_S)
     monkeypatch.setattr(Process, "running", property(lambda self: self._process is None))
+    monkeypatch.setattr(Process, "progress", "12 %  judging 400 of 3360 simulated robots")
     monkeypatch.setattr(Process, "last_words", "the bus: nothing answered at 1000000 baud → is 12 V on?")
     monkeypatch.setattr(Process, "stop", lambda self: None)
     return run

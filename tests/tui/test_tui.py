@@ -119,7 +119,7 @@ def a_diagnosis(robot: RobotFolder) -> Path:
             Found("stiffness_error", ("knee_fl",), {"scale": Span(0.62, 0.6, 0.64)}, 0.93, 0.81, 0.7, 0.9, True, {"scale": -0.478}),
             Found("coulomb_friction", "all", {"torque_nm": Span(0.02, 0.0, 0.04)}, 0.11, 0.04, -0.1, 0.1, True, {"torque_nm": 0.1}),
         ),
-        gap={"before": 0.0065, "after": 0.0013, "floor": 0.0004},
+        gap={"before": 0.0065, "after": 0.0013, "floor": 0.0004, "floor_from": "repeats"},
         where=[
             {"signal": "pos", "joint": "knee_fl", "regime": "fast", "share": 0.61},
             {"signal": "pos", "joint": "hip_fl", "regime": "slow", "share": 0.12},
@@ -556,8 +556,14 @@ def test_the_first_steps_from_the_box_and_the_terminal_closed_and_opened_again(
         app = OpenAnt(tmp_path / "my-ant", ticking=False)
         async with app.run_test(size=(80, 24)) as pilot:
             await pilot.pause()
+            assert screen_text(app).count("· done, virtual") == 2
+            assert "Connect  about 1 min" in screen_text(app), "the real robot begins at its beginning"
+            app.session.virtual = loose
+            await pilot.press("2", "enter")
+            await pilot.press("escape")
+            await pilot.pause()
             assert screen_text(app).count("✓ ok") == 2
-            assert "Motor IDs  about 10 min" in screen_text(app), "it goes on where it stopped"
+            assert "Continue my-ant · 2 of 15 · next: Motor IDs" in screen_text(app), "it goes on where it stopped"
 
     asyncio.run(build())
     asyncio.run(look_again())
@@ -853,7 +859,7 @@ def test_a_step_shows_the_robot_beside_it_from_its_first_moment_where_there_is_r
         async with app.run_test(size=(120, 40)) as pilot:
             app.push_screen(StepScreen(WALK["centre"]))
             await until(pilot, lambda: "Begin" in offered(app))
-            assert "servo         angle torque" in screen_text(app)
+            assert "servo             angle  load     A  °C    V" in screen_text(app)
         app.session.close()
 
     asyncio.run(look())

@@ -35,6 +35,7 @@ class FindingsScreen(Page):
     """The list on the left, the chosen one on the right."""
 
     TITLE = "Findings"
+    DOC = "robot-folder.md"
     HELP = """\
 # Findings and passport
 

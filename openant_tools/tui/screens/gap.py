@@ -20,10 +20,10 @@ from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.dialogs import Question
-from openant_tools.tui.marks import BLUE, GREEN, ORANGE, Name, mark, marked, overflow, plain, spelled
+from openant_tools.tui.marks import BLUE, GREEN, MARKS, ORANGE, Name, mark, marked, plain, spelled
 from openant_tools.tui.page import Page
 from openant_tools.tui.process import Process
-from openant_tools.tui.screens.recordings import runs_of
+from openant_tools.tui.screens.recordings import runs_of, when
 
 if TYPE_CHECKING:
     from openant_tools.gap.diagnosis import Diagnosis, Found
@@ -35,6 +35,11 @@ REFRESH_S = 1.0
 BAR = 12
 #: places and candidates shown; the report has all
 PLACES, CANDIDATES = 5, 5
+#: where a floor comes from, in words
+FLOORS = {
+    "repeats": ", by how much repeats of the same commands differ",
+    "sensors": ", by what the sensors can tell",
+}
 STAMP = "%Y%m%dT%H%M%SZ"
 IMPROVED = "improved.xml"
 NONE_YET = (
@@ -49,6 +54,7 @@ class GapScreen(Page):
     """Diagnoses and runs on the left, the chosen verdict on the right."""
 
     TITLE = "Gap"
+    DOC = "gap.md"
     HELP = """\
 # The gap between the robot and its simulation
 
@@ -96,7 +102,8 @@ improved model, which `w` writes beside the robot's own. The full report with pi
         self.draw_process()
 
     def _line(self, path: Path) -> Text:
-        return Text(f"[{'x' if path in self._chosen else ' '}] {self._names[path]}", no_wrap=True, overflow=overflow())
+        name = f"[{'x' if path in self._chosen else ' '}] {self._names[path]}"
+        return Text(name).append(f"\n    {when(path.stat().st_mtime)}", MARKS["todo"].colour)
 
     def _list(self) -> None:
         """Read which diagnoses there are."""
@@ -105,7 +112,7 @@ improved model, which `w` writes beside the robot's own. The full report with pi
         chooser = self.query_one("#diagnoses", Choices)
         chooser.clear_options()
         for path in self._files:
-            chooser.add_option(Option(Text(_when(path), no_wrap=True, overflow=overflow())))
+            chooser.add_option(Option(_when(path)))
         if self._files:
             chooser.highlighted = 0
         else:
@@ -141,7 +148,7 @@ improved model, which `w` writes beside the robot's own. The full report with pi
 
         verdict = self.query_one("#verdict", Static)
         try:
-            verdict.update(_page(read_diagnosis(path)))
+            verdict.update(_page(read_diagnosis(path), _when(path)))
         except OpenAntError as error:
             verdict.update(marked("fail", str(error)))
 
@@ -201,7 +208,7 @@ improved model, which `w` writes beside the robot's own. The full report with pi
         text = Text(f"{len(self._chosen)} of {len(self._runs)} runs chosen")
         if process is not None:
             if process.running:
-                text = marked("wait", process.last_words or "begun")
+                text = marked("wait", process.progress or "begun")
             elif process.exit_code == 0:
                 text = marked("ok", "done")
             elif process.exit_code == 130:
@@ -217,12 +224,12 @@ improved model, which `w` writes beside the robot's own. The full report with pi
 
 def _when(path: Path) -> str:
     try:
-        return datetime.datetime.strptime(path.stem, STAMP).strftime("%d.%m.%Y %H:%M UTC")
+        return when(datetime.datetime.strptime(path.stem, STAMP).replace(tzinfo=datetime.UTC).timestamp())
     except ValueError:
         return path.stem
 
 
-def _page(found: Diagnosis) -> Text:
+def _page(found: Diagnosis, when: str) -> Text:
     """The verdict in the order in which one asks: what, where, which, how far, what next."""
     from openant_tools.gap.regime import Regime
     from openant_tools.gap.words import SIGNALS, closed, closing, sentence, what_next
@@ -240,8 +247,11 @@ def _page(found: Diagnosis) -> Text:
     gap, share = found.gap, closed(found)
     text.append("\nHow far\n", "bold")
     before, after, floor = (number(float(gap[name]), "rad", name="gap") for name in ("before", "after", "floor"))
-    text.append(f" {before} {spelled('→')} {after} of position, floor {floor}\n closed ")
+    text.append(f" {before} {spelled('→')} {after} of position\n closed ")
     text.append_text(_bar(share, GREEN)).append(f" {closing(share):>5} on runs left out\n")
+    source = FLOORS.get(str(found.gap.get("floor_from")), "")
+    text.append(f" floor {floor}: what no model could beat{source}\n")
+    text.append(f" compared: {Path(found.model).name} with {', '.join(found.held_out or found.runs)}, {when}\n")
     text.append("\nNext\n", "bold")
     text.append(f" {spelled(what_next(found))}\n")
     for note in found.notes:

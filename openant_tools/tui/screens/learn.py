@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar, cast
@@ -20,7 +21,7 @@ from openant_tools.numbers import number, percent
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.curve import PAPER_CM_S, curve_lines, within_reach
 from openant_tools.tui.dialogs import Question
-from openant_tools.tui.marks import marked, plain, spelled
+from openant_tools.tui.marks import marked, overflow, plain, spelled
 from openant_tools.tui.page import Page
 from openant_tools.tui.training import AGENTS, Place, PlayProcess, TrainingProcess, curve_so_far
 
@@ -30,6 +31,8 @@ REFRESH_S = 1.0
 ON_ROBOT = " robot"
 FIRST = "first"
 EVALUATE, PLAY, COMPARE, DIAGNOSE = "evaluate", "play", "compare", "diagnose"
+#: lines of figures below a curve, to which it gives its room
+FIGURES = 6
 #: lines of the curve
 MOST_ROWS = 16
 #: the paper's list for the start of an experiment
@@ -54,6 +57,7 @@ class LearnScreen(Page):
     """What to train above, how it goes below."""
 
     TITLE = "Learn"
+    DOC = "learning.md"
     HELP = """\
 # Learn
 
@@ -70,7 +74,7 @@ The curve is the average reward over the last 120 s of robot time, in cm/s: how 
 is what the paper's agents reached, once the curve comes near it.
 
 With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is recorded), *compare* it with the other runs, or
-`d`: have its last recording on the robot *diagnosed*, which says what the simulation lacks.
+`d`, once it was played on the robot: have its last recording there *diagnosed*, which says what the simulation lacks.
 """
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("d", "diagnose", "Diagnose"),
@@ -115,8 +119,17 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
             Option(f"Evaluate {run.name} in simulation", id=EVALUATE),
             Option(f"Play {run.name} on the robot: it moves", id=PLAY),
             Option("Compare all runs in simulation", id=COMPARE),
-            Option(f"Diagnose what {run.name} did on the robot (d)", id=DIAGNOSE),
+            *(
+                Option(f"Diagnose what {played.parts[-3]} did on the robot (d)", id=DIAGNOSE)
+                for played in self._played_last()
+            ),
         ]
+
+    def _played_last(self) -> list[Path]:
+        """The newest recording of a policy on the robot, if there is any."""
+        folder = self.session.folder
+        played = [] if folder is None else folder.runs.glob("*/recordings/*.mcap")
+        return sorted(played, key=lambda path: path.stat().st_mtime)[-1:]
 
     def on_mount(self) -> None:
         super().on_mount()
@@ -130,6 +143,7 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         chooser.add_options(self._options())
         chooser.highlighted = 0
         self._offered_while = self.session.learning
+        self.refresh_bindings()
 
     def _use(self, choice: str) -> None:
         """Do with the newest run what was chosen."""
@@ -176,16 +190,11 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
 
     def action_diagnose(self) -> None:
         """Have the newest recording of a policy diagnosed, on the screen of the gap."""
-        folder = self.session.folder
-        played = (
-            []
-            if folder is None
-            else sorted(folder.runs.glob("*/recordings/*.mcap"), key=lambda path: path.stat().st_mtime)
-        )
-        if not played:
-            self.notify("no policy was played on the robot yet: play it there first", severity="warning")
-            return
-        self.ant.diagnose(played[-1])
+        for recording in self._played_last():
+            self.ant.diagnose(recording)
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        return bool(self._played_last()) if action == "diagnose" else True
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
         self.query_one("#choices").focus()
@@ -223,7 +232,7 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         """Train, or go on with the run of the same agent, place and seed; `first` as the demo does."""
         folder = self.session.folder
         if folder is None:
-            self.notify("there is no robot's folder: make one in Settings (s on the first screen)", severity="error")
+            self.notify("there is no robot's folder: make one in Setup (s on the first screen)", severity="error")
             return
         if self.session.learning:
             self.notify("a run is in progress: stop it first", severity="warning")
@@ -254,9 +263,11 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         """How the run at hand goes, in so many lines."""
         training, folder = self.session.training, self.session.folder
         text = Text()
-        if training is not None:
+        if isinstance(training, PlayProcess):
+            self._played(text, training, room)
+        elif training is not None:
             if training.running:
-                text.append_text(marked("wait", "training" if isinstance(training, TrainingProcess) else "playing"))
+                text.append_text(marked("wait", "training"))
             else:
                 code = training.exit_code
                 text.append_text(
@@ -264,10 +275,7 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
                     else marked("fail", training.last_words)
                 )  # fmt: skip
             text.append(f"   {training.command}\n")
-            if isinstance(training, TrainingProcess):
-                self._curve(text, training.folder, training.steps, room)
-            else:
-                text.append("\n".join(training.said))
+            self._curve(text, training.folder, training.steps, room)
         elif folder is not None:
             run = self._newest()
             if run is not None:
@@ -276,6 +284,27 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         if not text:
             text.append("No run yet.")
         return text
+
+    def _played(self, text: Text, playing: PlayProcess, room: int) -> None:
+        """What is done with trained agents: how far it is, the curve of the run, and below it the figures."""
+        width, code = self.size.width - 2, playing.exit_code
+        if playing.running:
+            text.append_text(marked("wait", playing.progress or "playing"))
+        elif code in (0, 130):
+            text.append_text(marked("ok", "done") if code == 0 else marked("warn", "stopped"))
+        else:
+            text.append_text(marked("fail", playing.last_words))
+        text.append(f"   {playing.command}")
+        text.truncate(max(width, len(text.plain.partition("   ")[0])), overflow=overflow())
+        text.append("\n")
+        said = playing.said if code in (None, 0) else []
+        # Before what the command has to remark.
+        said.sort(key=lambda words: words.startswith("openant: "))
+        lines = [line for words in said for line in textwrap.wrap(spelled(words), width)]
+        # The figures come first; the curve has what they leave of the room, and in a small window the last words go.
+        if curve_so_far(playing.folder):
+            self._curve(text, playing.folder, None, max(room - min(len(lines), FIGURES), 0))
+        text.append("\n".join(lines))
 
     def _curve(self, text: Text, run: Path, steps: int | None, room: int) -> None:
         points = curve_so_far(run)

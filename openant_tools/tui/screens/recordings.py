@@ -21,7 +21,7 @@ from openant_tools.tui.choices import Choices
 from openant_tools.tui.feeds import ReplayFeed
 from openant_tools.tui.page import Page
 
-__all__ = ["RecordingsScreen", "runs_of"]
+__all__ = ["RecordingsScreen", "runs_of", "when"]
 
 SUFFIXES = (".mcap", ".parquet", ".csv")
 
@@ -36,10 +36,16 @@ def runs_of(folder: RobotFolder | None) -> dict[Path, str]:
     return {path: found[path] for path in sorted(made, key=lambda path: made[path], reverse=True)}
 
 
+def when(stamp: float) -> str:
+    """A time in s since 1970 as people read it."""
+    return f"{datetime.datetime.fromtimestamp(stamp, datetime.UTC):%d.%m.%Y %H:%M} UTC"
+
+
 class RecordingsScreen(Page):
     """Choose a recording of the robot's, or name any other run."""
 
     TITLE = "Recordings"
+    DOC = "recordings.md"
     HELP = """\
 # Recordings
 
@@ -64,13 +70,12 @@ that has the columns of docs/recordings.md.
         chooser = self.query_one("#list", Choices)
         for index, path in enumerate(self._files):
             stat = path.stat()
-            when = datetime.datetime.fromtimestamp(stat.st_mtime).strftime("%d.%m.%Y %H:%M")
             size = (
                 number(stat.st_size / 1e6, "MB")
                 if stat.st_size >= 1e6
                 else number(stat.st_size / 1e3, "kB", decimals=0)
             )
-            chooser.add_option(Option(Text(f"{names[path]:40.40} {size:>10}  {when}"), id=str(index)))
+            chooser.add_option(Option(Text(f"{names[path]:40.40} {size:>10}  {when(stat.st_mtime)}"), id=str(index)))
         if self._files:
             chooser.highlighted = 0
         else:

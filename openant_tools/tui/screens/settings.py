@@ -27,9 +27,10 @@ __all__ = ["SettingsScreen"]
 class SettingsScreen(Page):
     """Choose or make a robot's folder; colours; ASCII; facts for a report of a fault."""
 
-    TITLE = "Settings"
+    TITLE = "Setup"
+    DOC = "robot-folder.md"
     HELP = """\
-# Settings
+# Setup
 
 **The robot's folder** holds everything about one robot: `robot.toml`, models, recordings, findings. Name one that is
 there, or a new place, and press `Enter`; then choose below whether to open it or to make a new robot in it.

@@ -44,7 +44,7 @@ from openant_tools.tui.leg_map import LegMap
 from openant_tools.tui.marks import MARKS, Name, mark, marked, overflow, plain, spelled
 from openant_tools.tui.page import Page, put
 from openant_tools.tui.screens.walk import standing_mark
-from openant_tools.tui.step_help import step_help
+from openant_tools.tui.step_help import step_doc, step_help
 from openant_tools.tui.step_run import BY_VIRTUAL_HANDS, StepRun
 
 __all__ = ["StepScreen"]
@@ -111,8 +111,9 @@ The step says what it will do and which registers it will change, and does nothi
 and can be begun again: what it found or wrote before stays, and every write to a servo's memory stands in
 `journal.jsonl` with the value before, so that it can be undone.
 
-The table shows each joint while something reads it: whether its servo answers, angle, torque, load, heat, supply; the drawing
-beside it where the legs are. When the step has ended its numbers stand there: a bar's thick part is what is allowed, the dot
+The table shows each joint while something reads it: whether its servo answers, angle, load (of servos that
+measure no current; `A` is the current of the others), heat, supply; the line at the top whether torque is on. What is not of
+now is dimmed, with how long ago it was. The drawing beside the table shows where the legs are. When the step has ended its numbers stand there: a bar's thick part is what is allowed, the dot
 where the number lies. `l` shows the log of what was said and done instead.
 """
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -143,6 +144,10 @@ where the number lies. `l` shows the log of what was said and done instead.
     @property
     def about(self) -> str:
         return step_help(self.step)
+
+    @property
+    def doc(self) -> str:
+        return step_doc(self.step)
 
     @property
     def verdict(self) -> Text:
@@ -242,9 +247,9 @@ where the number lies. `l` shows the log of what was said and done instead.
             self.say(Text(words))
         if folder is None:
             self.say(
-                marked("warn", f"there is no robot's folder at {self.session.path.resolve()}: make one in Settings (s)")
+                marked("warn", f"there is no robot's folder at {self.session.path.resolve()}: make one in Setup (s)")
             )
-            self.offer("", [StepChoice("Settings", lambda: self.ant.action_go("settings")), self._back()])
+            self.offer("", [StepChoice("Setup", lambda: self.ant.action_go("settings")), self._back()])
             return
         one = self._standing(folder)
         if one.waits_for:
@@ -256,7 +261,10 @@ where the number lies. `l` shows the log of what was said and done instead.
         self.draw()
 
     def _standing(self, folder: RobotFolder) -> Standing:
-        return standing(folder)[self.step.name] if self.step.name in WALK else beside(folder, self.step)
+        real = self.session.virtual is None
+        if self.step.name in WALK:
+            return standing(folder, real=real)[self.step.name]
+        return beside(folder, self.step, real=real)
 
     def _needs(self) -> list[str]:
         """What must be at hand, and what it does to the robot."""

@@ -22,7 +22,7 @@ from openant_tools.tui.found import sign
 from openant_tools.tui.leg_map import LegMap
 from openant_tools.tui.marks import Name, mark, marked, plain, spelled
 from openant_tools.tui.page import Page
-from openant_tools.tui.step_help import step_help
+from openant_tools.tui.step_help import step_doc, step_help
 
 __all__ = ["WalkScreen", "continues", "standing_mark"]
 
@@ -34,12 +34,18 @@ def standing_mark(one: Standing) -> Text:
     """A step's state; of one that was left in the middle how far it was."""
     if one.left is not None and one.state != "ok":
         return marked("warn", f"{one.left.words} done")
+    if one.virtual:
+        return marked("todo", "done, virtual")
     return marked(_MARKS[one.state])
 
 
-def continues(folder: RobotFolder) -> str:
-    """How far a robot's walk is, and what is next: `Continue my-ant · 3 of 15 · next: Motor IDs`."""
-    states = standing(folder)
+def continues(folder: RobotFolder, *, real: bool = True) -> str:
+    """How far a robot's walk is, and what is next: `Continue my-ant · 3 of 15 · next: Motor IDs`.
+
+    Args:
+        real: whether what was found on a virtual robot counts for nothing.
+    """
+    states = standing(folder, real=real)
     done = sum(one.state == "ok" for one in states.values())
     following = next((one for one in states.values() if one.state != "ok"), None)
     words = f"Continue {folder.path.resolve().name} · {done} of {len(states)}"
@@ -65,6 +71,7 @@ will do before it does anything. You can leave a step, come back, repeat it, and
 | `✗` no | it found something: open it and read what to do |
 | `?` doubt | it cannot judge: open it and read why |
 | `↻` again | a step that it builds on was done again since |
+| `·` done, virtual | done on a virtual robot only: counts while one is in use, not for the real robot |
 
 No robot here? The line below the steps starts a virtual one, which behaves like a real one down to its bytes.
 """
@@ -74,6 +81,7 @@ class WalkScreen(Page):
     """Steps on the left, what the chosen one does and the robot on the right."""
 
     TITLE = "Walk"
+    DOC = "bring-up.md"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("v", "app.virtual", "Virtual"),
         Binding("c", "app.watch", "Live"),
@@ -115,8 +123,9 @@ class WalkScreen(Page):
         walk = self.query_one(WalkList)
         chosen, names = walk.highlighted, list(WALK)
         folder = self.session.folder
-        before, self._standing = self._standing, standing(folder) if folder is not None else {}
-        words = "No robot yet: Enter on a step makes its folder" if folder is None else continues(folder)
+        real = self.session.virtual is None
+        before, self._standing = self._standing, standing(folder, real=real) if folder is not None else {}
+        words = "No robot yet: Enter on a step makes its folder" if folder is None else continues(folder, real=real)
         self.query_one("#continue", Static).update(Text(spelled(words), style="bold"))
         if folder is not None and folder.path != self._shown:
             chosen, self._shown = None, folder.path
@@ -142,10 +151,17 @@ class WalkScreen(Page):
         self.query_one(WalkList).highlighted = list(WALK).index(name)
 
     @property
-    def about(self) -> str:
+    def _chosen_step(self) -> Step | None:
         option = self.query_one(WalkList).highlighted_option
-        name = None if option is None else option.id
-        return step_help(WALK[name]) if name is not None and name in WALK else ""
+        return None if option is None or option.id is None else WALK.get(option.id)
+
+    @property
+    def about(self) -> str:
+        return "" if self._chosen_step is None else step_help(self._chosen_step)
+
+    @property
+    def doc(self) -> str:
+        return self.DOC if self._chosen_step is None else step_doc(self._chosen_step)
 
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
         about = self.query_one("#about", Static)
@@ -192,6 +208,8 @@ def _about(step: Step, one: Standing | None) -> Text:
     text = Text.assemble((f"{step.title}", "bold"), f"  about {number(step.minutes)} min\n{step.does}\n")
     if one is not None and one.left is not None:
         text.append(f"{mark('warn')} left at {one.left.words}; next: {one.left.next}\n", "bold")
+    if one is not None and one.virtual:
+        text.append(f"{mark('todo')} done on a virtual robot: it does not count for the real one\n", "bold")
     if one is not None and one.finding is not None:
         text.append(f"{mark(sign(one.finding))} {one.finding.what}\n", "bold")
     if one is not None and one.waits_for:
