@@ -888,3 +888,12 @@ def test_a_servo_that_loses_answers_is_named(tmp_path):
         finding, _ = ant.do(comms_health(ant.bench))
         assert not finding.ok
         assert finding.problems[0].startswith("hip_fl:")
+
+
+def test_a_bus_that_loses_answers_of_all_servos_alike_blames_no_cable_of_one(tmp_path, brisk):
+    with robot(tmp_path / "ant", fault=[{"cause": "line_noise", "byte_error": 0.001}]) as ant:
+        for step in (comms_health, bounds):
+            finding, _ = ant.do(step(ant.bench))
+            lost = [line for line in finding.problems if "answers" in line]
+            assert len(lost) == 1, finding.problems
+            assert "the power plug and the supply, the adapter and its first cable, or a busy computer" in lost[0]
