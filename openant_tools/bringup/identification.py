@@ -111,6 +111,7 @@ def identification(bench: Bench) -> Procedure:
         problems=()
         if closer or disagree
         else ("no fitted value predicts better than the nominal model → it stays in use",),
+        stands=True,
     )
 
 

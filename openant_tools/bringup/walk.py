@@ -257,7 +257,7 @@ class Standing:
     Attributes:
         finding: its newest; None where it has not been done.
         state: `stale` where a step that it needs has been done again since.
-        waits_for: steps that it needs and that have not said yes yet.
+        waits_for: steps that it needs and whose findings do not serve yet.
         left: how far it was when it was left in the middle; None where it was not.
     """
 
@@ -299,7 +299,7 @@ def _standing(folder: RobotFolder, step: Step, found: Mapping[str, Finding | Non
         state = "stale" if newer else "ok"
         if not finding.ok:
             state = "unsure" if finding.ok is None else "failed"
-    waits = tuple(name for name in step.needs if (seen := found[name]) is None or not seen.ok)
+    waits = tuple(name for name in step.needs if (seen := found[name]) is None or not seen.serves)
     return Standing(step, finding, state, waits, unfinished(folder, step.name))
 
 

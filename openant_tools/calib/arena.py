@@ -300,6 +300,7 @@ def arena(bench: Bench) -> Procedure:
         },
         problems=(*wrong, *problems),
         unsure=tuple(unsure),
+        stands=True,
     )
 
 

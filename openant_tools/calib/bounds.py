@@ -212,7 +212,7 @@ def bounds(bench: Bench) -> Procedure:
         ok,
         f"ranges of {len(ranges)} joints, bounds of {len(found)} observations from {sum(len(run.t) for run in runs)} steps",
         tuple(evidence),
-        "" if ok else "look at the joints that are named; the bounds stand and can be used",
+        "" if ok else "look at the joints that are named and run it again; until then these bounds are in use",
         COMMAND,
         data={
             "limits_rad": limits,
@@ -225,6 +225,7 @@ def bounds(bench: Bench) -> Procedure:
             "recordings": recording,
         },
         problems=tuple(problems),
+        stands=True,
     )
 
 

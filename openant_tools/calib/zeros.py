@@ -233,6 +233,7 @@ def zeros(bench: Bench) -> Procedure:
             "swapped": owner,
         },
         problems=tuple(problems),
+        stands=True,
     )
 
 

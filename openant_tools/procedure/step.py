@@ -262,7 +262,7 @@ class Step:
         name: as in `openant calib NAME` and in the names of its findings.
         title: as on the screen.
         does: one sentence.
-        needs: steps that must have said yes before; things on the table come in `table`.
+        needs: steps whose findings must serve before; things on the table come in `table`.
         table: what must be at hand.
         changes: what it writes (registers, robot.toml); "" where it changes nothing.
         moves: whether the robot moves. holds: whether torque goes on although nothing moves.

@@ -716,6 +716,7 @@ def test_turns_that_fit_no_sensor_are_asked_for_again_and_not_judged(tmp_path, m
         kept = ant.folder.config()
         assert kept.provenance_of("imu.gyro_counts_per_dps") is None
         assert kept.imu.acc_counts_per_g == pytest.approx(512, rel=0.01), "what was measured is kept"
+        assert finding.serves, "and the next step can use it"
 
 
 @given(
