@@ -223,8 +223,8 @@ def nudge(bench: Bench, servo: Servo, baud: int, angle_rad: float = NUDGE_RAD) -
         engine.ask(messages.Ramp(end))
         engine.ask(messages.Hold(SETTLE_S))
         counts: int = engine.ask(messages.ReadRegister("present_position"))[servo.joint]
-        went = counts * RAD_PER_PULSE - float(start[0])
-        yield Live({servo.joint: went}, "rad", "nudged")
+        went = servo.to_joint(counts * RAD_PER_PULSE) - float(start[0])
+        yield Live({servo.joint: went}, "rad", "nudged by")
         engine.ask(messages.Ramp(start))
         engine.ask(messages.Hold(SETTLE_S))
     return abs(went)

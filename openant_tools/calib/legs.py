@@ -12,7 +12,7 @@ from openant_tools.calib.wires import BOOT_S, in_joints, opened_bus, robot_servo
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.faults import Cause
 from openant_tools.comms.lateness import LATE_S, REMEDY
-from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servo, Servos
+from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servos
 from openant_tools.errors import HardwareFault
 from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
@@ -93,9 +93,9 @@ def _one(bench: Bench, leg: Leg, config: RobotConfig) -> Subroutine[list[Evidenc
     with opened_bus(bench) as bus:
         evidence = yield from _by_hand(bus, joints, config)
     yield Intent(f"nudge {' and '.join(joints)} by {number(NUDGE_RAD, 'rad', decimals=0)}, gently", moves=True)
-    for joint in joints:
-        motor = config.motors[joint]
-        went = yield from nudge(bench, Servo(joint, motor.id, motor.servo), config.bus.baud, NUDGE_RAD)
+    for servo in robot_servos(config, joints):  # told from the zero that they had while hands moved them
+        joint = servo.joint
+        went = yield from nudge(bench, servo, config.bus.baud, NUDGE_RAD)
         evidence.append(Evidence(f"nudge of {joint}", went, "rad", "encoder", least=NUDGED_RAD))
         if went < NUDGED_RAD:
             raise HardwareFault(

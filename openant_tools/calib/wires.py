@@ -130,7 +130,7 @@ def engine_config(bench: Bench, **more: object) -> EngineConfig:
 
 
 def bare_config(bench: Bench, servos: Sequence[Servo], baud: int) -> EngineConfig:
-    """The engine's config for servos as they come: each joint's angle is the servo's own, within its one turn."""
+    """The engine's config for servos as they come, each within its one turn, with its angle told from its own zero."""
     return EngineConfig(
         port=find_bus(bench.bus, bench.folder.config()),
         servos=tuple(servos),
@@ -138,11 +138,17 @@ def bare_config(bench: Bench, servos: Sequence[Servo], baud: int) -> EngineConfi
         control=bench.control,
         # A servo may lie anywhere, and hands may turn it while it is limp.
         guards=Guards(angle_margin_rad=None),
-        limits_rad={servo.joint: (0.0, 2 * math.pi - RAD_PER_PULSE) for servo in servos},
+        limits_rad={servo.joint: _one_turn(servo) for servo in servos},
         # What is set in them is looked at when they have their ids.
         anyway=True,
         journal=str(bench.folder.journal),
     )
+
+
+def _one_turn(servo: Servo) -> tuple[float, float]:
+    """rad: the ends of a servo's one turn, at the joint."""
+    low, high = sorted(servo.to_joint(end) for end in (0.0, 2 * math.pi - RAD_PER_PULSE))
+    return low, high
 
 
 def heard(engine: EngineProcess) -> Subroutine[None]:

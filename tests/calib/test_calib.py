@@ -384,6 +384,24 @@ def test_a_leg_is_watched_until_hands_have_moved_it(tmp_path):
         assert finding.ok, builder.said
 
 
+def test_a_leg_is_told_from_one_zero_before_and_while_its_motor_nudges_it(tmp_path):
+    """Half a turn lay between what hands and what the motor showed."""
+    by_hand, by_motor = dict[str, float](), dict[str, float]()
+
+    def look(event: Event) -> None:
+        if isinstance(event, Live) and event.angles_rad:
+            by_hand.update(event.angles_rad)
+        elif isinstance(event, Live):
+            (engine,) = EngineProcess.running
+            rows = engine.telemetry()
+            by_motor.update({joint: float(rows[0, engine.columns.index(f"pos.{joint}")]) for joint in event.values})
+
+    with robot(tmp_path / "ant") as ant:
+        finding, _ = ant.do(legs(replace(ant.bench, joints=("hip_fl",))), ant.builder(before=look))
+    assert finding.ok
+    assert by_motor == pytest.approx(by_hand, abs=0.2)
+
+
 def test_legs_are_proven_one_by_one_and_a_bad_cable_is_named(tmp_path):
     fault = [{"cause": "bad_cable", "where": "knee_fr", "fraction": 0.2}]
     with robot(tmp_path / "ant", fault=fault) as ant:
