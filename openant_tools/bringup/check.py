@@ -412,7 +412,7 @@ def _against_model(
         return []
     config = bench.folder.config()
     model = bench.folder.model_path(config)
-    found = yield from relayed(lambda progress, notice: measure([run], model, effects=config.effects))
+    found = yield from relayed(lambda progress: measure([run], model, effects=config.effects))
     evidence.append(
         Evidence("position gap of the twitch", found.gaps.get("pos"), "rad", f"{model.name}, 0.5 s horizon")
     )

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from openant_tools.comms.restart import RULES, MotionStopped, StopCause
 from openant_tools.errors import BadInput, OpenAntError, StorageFault
 from openant_tools.procedure.finding import Finding, keep, latest
-from openant_tools.procedure.step import Bench, Declined, Face, Say, Step, drive
+from openant_tools.procedure.step import Bench, Declined, Face, Say, Step, StepAt, drive
 from openant_tools.procedure.unfinished import Unfinished, unfinished
 
 if TYPE_CHECKING:
@@ -340,15 +340,14 @@ def walk(
     face: Face,
     *,
     again: bool = False,
-    notice: Callable[[Step, Finding | None], None] = lambda step, found: None,
 ) -> dict[str, Finding]:
-    """All steps in order; those that stand are not done again, those whose needs say no are left out.
+    """All steps in order; those that stand are not done again, those whose needs do not serve are left out. The face is told
+    of each that begins, and of its finding (`StepAt`).
 
     A stop that ends motion for good (`comms.restart`) ends the walk: what it would move next waits for a new command.
 
     Args:
         again: do every step, also those that stand.
-        notice: called with each step before it is done (None), and with its finding afterwards.
 
     Returns:
         step → its newest finding, for the steps that have one.
@@ -356,7 +355,7 @@ def walk(
     Raises:
         Declined: an intent was not granted; the walk resumes at that step.
     """
-    for name, step in WALK.items():
+    for place, (name, step) in enumerate(WALK.items(), 1):
         now = standing(bench.folder, real=not bench.virtual)[name]
         if now.state == "ok" and not again:
             continue
@@ -364,9 +363,9 @@ def walk(
             titles = ", ".join(WALK[other].title for other in now.waits_for)
             face.answer(Say(f"{step.title} is left out: it needs {titles}", "warn"))
             continue
-        notice(step, None)
+        face.answer(StepAt(step, place, len(WALK)))
         found = do(step, bench, face)
-        notice(step, found)
+        face.answer(StepAt(step, place, len(WALK), found))
         cause = found.data.get(STOPPED)
         if cause is not None and not RULES[StopCause(cause)].faces:
             face.answer(Say("motion has ended for good: look at the robot, then begin the walk again", "fail"))

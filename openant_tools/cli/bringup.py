@@ -10,7 +10,6 @@ from typing import Any
 import click
 
 from openant_tools.cli.hardware import Moving, adapter_option, camera_option, imu_option
-from openant_tools.cli.log import mention
 from openant_tools.cli.options import json_option
 from openant_tools.cli.virtual_for_command import virtual_option
 from openant_tools.numbers import number
@@ -57,10 +56,9 @@ def bringup(
       openant bringup --robot try-ant --virtual --yes
     """
     from openant_tools.bringup.walk import WALK, standing, walk
-    from openant_tools.cli.face import CommandFace, echo_finding
+    from openant_tools.cli.face import CommandFace
     from openant_tools.files import json_text, write_text
-    from openant_tools.procedure.finding import Finding
-    from openant_tools.procedure.step import Bench, Step
+    from openant_tools.procedure.step import Bench
     from openant_tools.robot.folder import RobotFolder, create_robot
 
     began = time.monotonic()
@@ -78,16 +76,7 @@ def bringup(
         if hands is not None:
             hands.resume(standing(folder)["legs"].state == "ok")
         bench = Bench(folder, port, imu, camera, control)
-
-        def notice(step: Step, found: Finding | None) -> None:
-            place = list(WALK).index(step.name) + 1
-            if found is None:
-                mention(f"{place}/{len(WALK)} {step.title}")
-            else:
-                click.echo(f"{place}/{len(WALK)} {step.title}: ", nl=False)
-                echo_finding(found)
-
-        walk(bench, face, again=again, notice=notice)
+        walk(bench, face, again=again)
         states = standing(folder)
     red = [name for name, now in states.items() if now.state != "ok"]
     result: dict[str, Any] = {

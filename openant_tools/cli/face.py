@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.prompt import Confirm, FloatPrompt, Prompt
 
 from openant_tools.cli.hardware import need_moving, need_terminal
-from openant_tools.cli.log import is_quiet
+from openant_tools.cli.log import is_quiet, mention
 from openant_tools.cli.streams import has_terminal
 from openant_tools.errors import BadInput
 from openant_tools.numbers import number, percent, span
@@ -27,6 +27,7 @@ from openant_tools.procedure.step import (
     Live,
     Progress,
     Say,
+    StepAt,
     change_lines,
 )
 
@@ -68,6 +69,12 @@ class CommandFace:
                 self._line(
                     escape(words) + (f"\n{escape(drawing)}" if drawing else "") + (f" ({picture})" if picture else "")
                 )
+            case StepAt(step, place, count, finding):
+                if finding is None:
+                    mention(f"{place}/{count} {step.title}")
+                else:
+                    click.echo(f"{place}/{count} {step.title}: ", nl=False)
+                    echo_finding(finding)
             case Live():
                 return self._show(event)
             case Intent() | Hands() | Ask():

@@ -33,12 +33,14 @@ __all__ = [
     "Face",
     "Hands",
     "Intent",
+    "Kept",
     "Live",
     "Procedure",
     "Progress",
     "RegisterChange",
     "Say",
     "Step",
+    "StepAt",
     "change_lines",
     "drive",
 ]  # fmt: skip
@@ -179,7 +181,28 @@ class Drawing:
     picture: Path | None = None
 
 
-Event = Progress | Say | Intent | Ask | Hands | Live | Drawing
+@dataclass(frozen=True)
+class Kept:
+    """A recording is whole: it stays, whatever becomes of what follows. No answer."""
+
+    path: Path
+
+
+@dataclass(frozen=True)
+class StepAt:
+    """A step of the walk begins; with its finding, it has ended. No answer.
+
+    Attributes:
+        place, count: the how manieth of how many.
+    """
+
+    step: Step
+    place: int
+    count: int
+    finding: Finding | None = None
+
+
+Event = Progress | Say | Intent | Ask | Hands | Live | Drawing | Kept | StepAt
 Answer = bool | str | float | None
 #: A part of a procedure, with a result of its own: `result = yield from part(...)`.
 Subroutine = Generator[Event, Answer, T]

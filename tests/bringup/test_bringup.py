@@ -19,7 +19,7 @@ from openant_tools.comms.clock import VirtualControl
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.procedure.finding import Finding, keep
 from openant_tools.procedure.relay import relayed, within
-from openant_tools.procedure.step import Answer, Ask, Declined, Event, Intent, Progress, Say
+from openant_tools.procedure.step import Answer, Ask, Declined, Event, Intent, Progress, StepAt
 from openant_tools.robot.config import Provenance
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES
@@ -133,12 +133,13 @@ def test_a_closed_terminal_resumes_at_the_step_that_was_not_done(tmp_path):
         class Begun(Exception):
             pass
 
-        def notice(one, finding):
-            raise Begun(one.name, finding)
+        def before(event: Event) -> None:
+            if isinstance(event, StepAt):
+                raise Begun(event.step.name, event.place, event.finding)
 
         with pytest.raises(Begun) as first:
-            walk(ant.bench, ant.builder(), notice=notice)
-        assert first.value.args == ("ids", None)
+            walk(ant.bench, ant.builder(before=before))
+        assert first.value.args == ("ids", 3, None)
 
 
 def test_steps_that_need_what_said_no_are_left_out_in_words(tmp_path):
@@ -161,9 +162,9 @@ def test_steps_that_need_what_said_no_are_left_out_in_words(tmp_path):
 def test_work_with_callbacks_is_a_procedure_and_ends_when_it_is_closed():
     seen, ended = [], []
 
-    def work(progress, notice):
+    def work(progress):
         try:
-            notice("begun")
+            progress(0.0, "begun")
             for k in range(1000):
                 progress(k / 1000, "working")
         finally:
@@ -173,7 +174,7 @@ def test_work_with_callbacks_is_a_procedure_and_ends_when_it_is_closed():
     procedure = relayed(work)
     seen.append(next(procedure))
     procedure.close()
-    assert seen == [Say("begun")]
+    assert seen == [Progress(0.0, "begun")]
     assert ended == [True]
     result = []
 
@@ -210,7 +211,7 @@ def test_work_that_is_a_part_tells_its_share_of_the_whole_and_is_ended_with_it()
 
 
 def test_what_the_work_raises_is_raised_by_the_procedure():
-    def work(progress, notice):
+    def work(progress):
         raise HardwareFault("it fell")
 
     with pytest.raises(HardwareFault, match="it fell"):
