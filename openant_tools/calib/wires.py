@@ -30,7 +30,7 @@ from openant_tools.robot.config import MotorSection, RobotConfig
 from openant_tools.robot.registers import RAD_PER_PULSE
 
 __all__ = [
-    "BOOT_S", "SETTLE_S", "bare_config", "engine_config", "heard", "in_joints", "journalled", "opened_bus", "opened_imu", "rest", "robot_servos", "servo_angles", "wait",
+    "BOOT_S", "SETTLE_S", "bare_config", "clock_of", "engine_config", "heard", "in_joints", "journalled", "opened_bus", "opened_imu", "rest", "robot_servos", "servo_angles", "wait",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -100,6 +100,15 @@ def opened_imu(bench: Bench) -> Iterator[tuple[Imu, Clock]]:
         yield imu, clock
     finally:
         imu.close()
+
+
+def clock_of(bench: Bench) -> Clock:
+    """The time by which the bench lives, where nothing is opened that brings its own."""
+    if bench.control is not None:
+        remote = VirtualControl(bench.control)
+        if remote.ask("now")["stepped"]:
+            return SteppedClock(remote)
+    return RealClock()
 
 
 def journalled(bus: Bus, servos: Sequence[Servo], bench: Bench, command: str) -> Servos:

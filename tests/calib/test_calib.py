@@ -64,6 +64,21 @@ def test_connect_finds_bus_and_imu_and_keeps_no_port_of_a_virtual_robot(tmp_path
         assert ant.folder.config().ports.bus == ""
 
 
+def test_connect_says_what_it_sees_of_the_camera_and_what_needs_one(tmp_path):
+    with robot(tmp_path / "ant", sees=True, camera={"width": 640, "height": 480}) as ant:
+        finding, builder = ant.do(connect(ant.bench))
+        assert finding.ok
+        assert finding.what.endswith(f"the camera {ant.bench.camera}")
+        assert "640 × 480 pixels" in builder.said
+        finding, builder = ant.do(connect(replace(ant.bench, camera="http://127.0.0.1:9/stream.mjpg")))
+        assert finding.ok, "all steps but the Arena go without"
+        assert finding.what.endswith("the camera shows nothing")
+        assert finding.problems[0].startswith("camera: http://127.0.0.1:9/stream.mjpg: no picture comes → ")
+        finding, builder = ant.do(connect(replace(ant.bench, camera=None)))
+        assert finding.what.endswith("no camera yet")
+        assert "to learn on the floor the robot needs one" in builder.said
+
+
 def test_connect_says_where_the_servos_answer_instead_of_the_imu(tmp_path):
     with robot(tmp_path / "ant") as ant:
         finding, _ = ant.do(connect(replace(ant.bench, imu="/nowhere")))
@@ -837,7 +852,7 @@ class ShownBoard:
 def test_a_board_before_the_camera_gives_the_lens_in_the_arena_step(tmp_path, monkeypatch):
     truth, ticks = Intrinsics(800, 600, 780, 776, 405, 296), itertools.count()
     monkeypatch.setattr(arena_step, "Camera", ShownBoard)
-    monkeypatch.setattr(arena_step, "_clock", lambda bench: SimpleNamespace(now=lambda: 0.1 * next(ticks)))
+    monkeypatch.setattr(arena_step, "clock_of", lambda bench: SimpleNamespace(now=lambda: 0.1 * next(ticks)))
     bench = Bench(create_robot(tmp_path / "ant"), camera="0")
 
     class Shower:
