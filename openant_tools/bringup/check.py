@@ -30,7 +30,7 @@ from openant_tools.gap.measure import measure
 from openant_tools.numbers import number, percent, span
 from openant_tools.procedure.finding import Evidence, Finding, latest
 from openant_tools.procedure.relay import relayed
-from openant_tools.procedure.step import Ask, Bench, Intent, Procedure, Progress, Say, Subroutine
+from openant_tools.procedure.step import Bench, Intent, Procedure, Progress, Say, Subroutine, confirmed
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.config import RobotConfig
@@ -91,7 +91,7 @@ def check(bench: Bench) -> Procedure:
     baseline = {joint: joint_sweep_of(one) for joint, one in bounds.data["sweep"].items()}
     evidence, problems, unsure = list[Evidence](), list[str](), list[str]()
     for line in START_LIST:
-        if (yield Ask(f"Before it moves: {line}. Is that so?", ("yes", "no"), default="yes")) != "yes":
+        if not (yield from confirmed(bench, f"Before it moves: {line}. Is that so?")):
             problems.append(f"not as it must be before it moves: {line} → see to it first")
     if problems:
         return _finding(problems, evidence, {})

@@ -14,7 +14,6 @@ from openant_tools.errors import BadInput
 from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import (
-    Ask,
     Bench,
     Drawing,
     Hands,
@@ -24,6 +23,7 @@ from openant_tools.procedure.step import (
     RegisterChange,
     Say,
     Subroutine,
+    confirmed,
 )
 from openant_tools.procedure.unfinished import Parts
 from openant_tools.robot.config import MotorSection
@@ -165,7 +165,7 @@ def _one(bench: Bench, motor: MotorSection) -> Subroutine[tuple[float, str]]:
                 f"{joint}: stopped {number(off, 'rad', sign=True, decimals=0)} from its mounting angle → is the shaft blocked?",
             )
         question = f"{joint} holds. Put the horn on as drawn and drive its screw in. Done?"
-        if (yield Ask(question, ("yes", "no"), default="yes")) != "yes":
+        if not (yield from confirmed(bench, question)):
             return off, f"{joint}: no horn yet → run the step again with --joint {joint}"
         turned = _off(engine, joint) - off
         if abs(turned) > CLOSE_RAD:

@@ -28,6 +28,7 @@ from openant_tools.procedure.step import (
     RegisterChange,
     Say,
     Subroutine,
+    confirmed,
 )
 from openant_tools.procedure.unfinished import Parts
 from openant_tools.robot.config import MotorSection, RobotConfig
@@ -149,13 +150,8 @@ def _one(
                 f"{motor.joint}: {name} reads {values[name]}, {count} was written → power it off and on and try again"
             )
     yield from nudge(bench, servos[motor.joint], config.bus.baud)
-    if (
-        yield Ask(
-            f"Did this servo, and only this one, blink and turn? It is the {words} from now on.",
-            ("yes", "no"),
-            default="yes",
-        )
-    ) != "yes":
+    seen_turning = f"Did this servo, and only this one, blink and turn? It is the {words} from now on."
+    if not (yield from confirmed(bench, seen_turning)):
         return _Wrong(
             f"{motor.joint}: id {motor.id} answered, but the servo at hand did not move → another one is on the cable, or its "
             "gear is broken"
@@ -243,7 +239,10 @@ def _rename(bench: Bench, found: Scan, motors: Sequence[MotorSection], config: R
         fits = [joint for joint in left if config.motors[joint].servo.number == one.model_number]
         own = config.motor_with_id(one.id)
         guess = own.joint if own is not None and own.joint in fits else fits[0] if fits else "none of them"
-        answer = yield Ask(f"Which joint is id {one.id} ({one.model})?", (*fits, "none of them"), default=guess)
+        question = f"Which joint is id {one.id} ({one.model})?"
+        if bench.virtual:
+            question += " (this robot is virtual: pretend that you see it)"
+        answer = yield Ask(question, (*fits, "none of them"), default=guess)
         if isinstance(answer, str) and answer in left:
             chosen[answer] = one
             left.remove(answer)

@@ -122,7 +122,8 @@ class CommandFace:
         return Confirm.ask("Do it?", console=self.console, default=True)
 
     def _by_hand(self, hands: Hands) -> bool:
-        self._line(f"[cyan]hands:[/cyan] {escape(hands.words)}")
+        whose = "hands" if self._hands is None else "virtual hands"
+        self._line(f"[cyan]{whose}:[/cyan] {escape(hands.words)}")
         if self._hands is not None:
             self._hands(hands)
         elif not self._yes and not hands.while_watching:

@@ -42,6 +42,7 @@ __all__ = [
     "Step",
     "StepAt",
     "change_lines",
+    "confirmed",
     "drive",
 ]  # fmt: skip
 
@@ -275,6 +276,14 @@ class Bench:
     def virtual(self) -> bool:
         """Whether it is a virtual robot, of which nothing that is found says anything of the real one."""
         return self.control is not None
+
+
+def confirmed(bench: Bench, question: str) -> Subroutine[bool]:
+    """Ask what only eyes and hands at the robot can tell; whether it is so. Of a virtual robot it is pretended, and said."""
+    if bench.virtual:
+        yield Say(f"{question} (yes: this robot is virtual, that is pretended)")
+        return True
+    return (yield Ask(question, ("yes", "no"), default="yes")) == "yes"
 
 
 @dataclass(frozen=True)

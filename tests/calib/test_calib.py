@@ -40,7 +40,7 @@ from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.intrinsics import CharucoBoard, Intrinsics
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import EepromWrite, Journal
-from openant_tools.procedure.step import Ask, Bench, Declined, Event, Hands, Intent, Live, Progress, drive
+from openant_tools.procedure.step import Ask, Bench, Declined, Event, Hands, Intent, Live, Progress, Say, drive
 from openant_tools.procedure.unfinished import Parts, unfinished
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
@@ -112,6 +112,9 @@ def test_eight_servos_from_the_box_get_their_ids_and_undo_takes_one_back(tmp_pat
         assert [ant.register(joint, "id") for joint in JOINT_NAMES] == [joint.id for joint in JOINTS.values()]
         assert {ant.register(joint, "baud_rate") for joint in JOINT_NAMES} == {3}
         assert "hip_rr: id 1 → 10" in builder.granted
+        assert not [event for event in builder.events if isinstance(event, Ask)], "nobody can see a virtual servo blink"
+        assert builder.said.count("blink and turn? It is the ") == 8
+        assert "from now on. (yes: this robot is virtual, that is pretended)" in builder.said
         assert not any(ant.torque())
         entries = Journal(ant.folder.journal).open_entries()
         assert len(entries) == 24
@@ -274,17 +277,19 @@ def test_ids_that_were_left_go_on_with_the_next_servo(tmp_path):
 def test_centring_that_was_left_goes_on_where_it_was_and_reads_again_what_was_done(tmp_path):
     with robot(tmp_path / "ant", **set_up()) as ant:
         with pytest.raises(KeyboardInterrupt):
-            ant.do(centre(ant.bench), ant.builder(before=leave_at(Ask, "hip_fr holds")))
+            ant.do(centre(ant.bench), ant.builder(before=leave_at(Say, "hip_fr holds")))
         assert not any(ant.torque())
         assert unfinished(ant.folder, "centre").words == "2 of 8"
         mode = ant.server.world.servos[1].model.register("operating_mode")
         ant.server.world.servos[1].memory[mode.address] = 4  # somebody has played with knee_rr meanwhile
-        builder = ant.builder(before=leave_at(Ask, "knee_fr holds"))
+        builder = ant.builder(before=leave_at(Say, "knee_fr holds"))
         with pytest.raises(KeyboardInterrupt):
             ant.do(centre(ant.bench), builder)
         assert "it goes on at 3 of 8: hip_rr, knee_rr were done before" in builder.said
         assert "knee_rr is not as it was left: its operating mode is 4, not 3; it is done again" in builder.said
-        asked = [event.question.split()[0] for event in builder.events if isinstance(event, Ask)]
+        asked = [
+            event.words.split()[0] for event in builder.events if isinstance(event, Say) and "holds." in event.words
+        ]
         assert asked == ["knee_rr", "hip_fr", "knee_fr"]
 
 
