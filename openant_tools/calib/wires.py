@@ -30,7 +30,7 @@ from openant_tools.robot.config import MotorSection, RobotConfig
 from openant_tools.robot.registers import RAD_PER_PULSE
 
 __all__ = [
-    "BOOT_S", "SETTLE_S", "bare_config", "clock_of", "engine_config", "heard", "in_joints", "journalled", "opened_bus", "opened_imu", "rest", "robot_servos", "servo_angles", "wait",
+    "BOOT_S", "SETTLE_S", "bare_config", "clock_of", "differs", "engine_config", "heard", "in_joints", "journalled", "opened_bus", "opened_imu", "rest", "robot_servos", "servo_angles", "wait",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -158,6 +158,16 @@ def _one_turn(servo: Servo) -> tuple[float, float]:
     """rad: the ends of a servo's one turn, at the joint."""
     low, high = sorted(servo.to_joint(end) for end in (0.0, 2 * math.pi - RAD_PER_PULSE))
     return low, high
+
+
+def differs(bus: Bus, motor: MotorSection) -> str:
+    """What of a servo does not read as robot.toml has it: silent, or another model; "" where it is that joint's."""
+    found = bus.ping(motor.id, insist=True)
+    if found is None:
+        return f"nothing answers under id {motor.id}"
+    if found.model_number != motor.servo.number:
+        return f"the model number under id {motor.id} is {found.model_number}, not {motor.servo.number}"
+    return ""
 
 
 def heard(engine: EngineProcess) -> Subroutine[None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import itertools
 import math
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import ClassVar
@@ -272,6 +273,56 @@ def test_ids_that_were_left_go_on_with_the_next_servo(tmp_path):
         assert plugged == ["knee_rr", "hip_fr"]
         ant.do(undo(ant.bench))  # what is taken back is to be done again
         assert unfinished(ant.folder, "ids") is None
+
+
+def test_a_servo_that_has_its_name_does_not_lose_it_to_the_next_joint(tmp_path):
+    """The one plugged in again by mistake, and, on the cable when the step goes on, one that reads otherwise."""
+    with robot(tmp_path / "ant", **LOOSE) as ant:
+        builder = ant.builder(mistakes={"hip_fr": "hip_rr"}, before=leave_at(Hands, "(knee_fr)"))
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(ids(ant.bench), builder)
+        assert (
+            "hip_fr: this servo has id 10, it is hip_rr since before → plug in one that has no name yet" in builder.said
+        )
+        assert ant.register("hip_rr", "id") == 10
+        assert unfinished(ant.folder, "ids").words == "2 of 8"
+        ant.server.world.servos[0].set("baud_rate", 1)
+        hands = ant.builder().hands
+        hands.do(Hands("", "plug", "hip_rr"))
+        hands.do(Hands("", "plug", "knee_rr"))
+        ant.server.world.advance(ant.server.world.now + 1.0)
+        builder = ant.builder(before=leave_at(Hands, "Plug in one servo"))
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(ids(ant.bench), builder)
+        assert not [event for event in builder.events if isinstance(event, Ask)], "one at a time is answered already"
+        assert "hip_rr is not as it was left: id 10 answers at 57600 baud; it is done again" in builder.said
+        assert "knee_rr is not as it was left" not in builder.said
+        assert "(hip_rr)" in builder.events[-1].words
+
+
+def test_legs_that_were_left_are_read_again_and_only_a_difference_reopens_one(tmp_path, brisk):
+    with robot(tmp_path / "ant") as ant:
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(legs(ant.bench), ant.builder(before=leave_at(Hands, "Connect hip_fl")))
+        assert unfinished(ant.folder, "legs").words == "2 of 4"
+        servos = dict(zip(JOINT_NAMES, ant.server.world.servos, strict=True))
+
+        def goes_on_with() -> tuple[str, str]:
+            builder = ant.builder(before=leave_at(Hands, "Connect"))
+            with pytest.raises(KeyboardInterrupt):
+                ant.do(legs(ant.bench), builder)
+            return builder.events[-1].words, builder.said
+
+        assert goes_on_with()[0] == "Connect hip_fl."
+        servos["hip_fr"].set("id", 77)
+        words, said = goes_on_with()
+        assert words == "Connect hip_fr."
+        assert "front right leg is not as it was left: hip_fr: nothing answers under id 20; it is done again" in said
+        assert "rear right leg is not" not in said
+        servos["hip_rr"].set("homing_offset", 1000)
+        words, said = goes_on_with()
+        assert words == "Connect hip_rr."
+        assert re.search("rear right leg is not as it was left: hip_rr is at 88°, hands moved it from", said)
 
 
 def test_centring_that_was_left_goes_on_where_it_was_and_reads_again_what_was_done(tmp_path):
