@@ -75,6 +75,9 @@ def test_connect_says_what_it_sees_of_the_camera_and_what_needs_one(tmp_path):
         assert finding.ok, "all steps but the Arena go without"
         assert finding.what.endswith("the camera shows nothing")
         assert finding.problems[0].startswith("camera: http://127.0.0.1:9/stream.mjpg: no picture comes → ")
+        ant.builder().hands.do(Hands("", "place", setup="loose"))  # type: ignore[arg-type]
+        finding, _ = ant.do(connect(ant.bench))
+        assert finding.what.endswith(f"the camera {ant.bench.camera}"), "of loose motors it sees the floor alone"
         finding, builder = ant.do(connect(replace(ant.bench, camera=None)))
         assert finding.what.endswith("no camera yet")
         assert "to learn on the floor the robot needs one" in builder.said
