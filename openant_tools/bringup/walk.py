@@ -9,16 +9,31 @@ from typing import TYPE_CHECKING, Any, Literal
 from openant_tools.comms.restart import RULES, MotionStopped, StopCause
 from openant_tools.errors import BadInput, OpenAntError, StorageFault
 from openant_tools.procedure.finding import Finding, keep, latest
-from openant_tools.procedure.step import Bench, Declined, Face, Say, Step, StepAt, drive
+from openant_tools.procedure.step import Ask, Bench, Declined, Face, Say, Step, StepAt, drive
 from openant_tools.procedure.unfinished import Unfinished, unfinished
 
 if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
 
-__all__ = ["BENCH", "BESIDE", "WALK", "Standing", "State", "beside", "do", "standing", "step", "walk"]
+__all__ = [
+    "BENCH",
+    "BESIDE",
+    "WALK",
+    "Standing",
+    "State",
+    "beside",
+    "do",
+    "findings",
+    "next_step",
+    "standing",
+    "step",
+    "walk",
+]
 
 #: key of a finding's data: the `StopCause` of what ended its motion
 STOPPED = "stop_cause"
+#: what one may do where a step says no
+AGAIN, GO_ON = "do it again", "go on"
 #: name → step, in order.
 WALK: Mapping[str, Step] = {
     step.name: step
@@ -344,7 +359,7 @@ def walk(
     """All steps in order; those that stand are not done again, those whose needs do not serve are left out. The face is told
     of each that begins, and of its finding (`StepAt`).
 
-    A stop that ends motion for good (`comms.restart`) ends the walk: what it would move next waits for a new command.
+    Whoever is asked may do a step again that says no. A stop that ends motion for good (`comms.restart`) ends the walk: what it would move next waits for a new command.
 
     Args:
         again: do every step, also those that stand.
@@ -363,11 +378,29 @@ def walk(
             titles = ", ".join(WALK[other].title for other in now.waits_for)
             face.answer(Say(f"{step.title} is left out: it needs {titles}", "warn"))
             continue
-        face.answer(StepAt(step, place, len(WALK)))
-        found = do(step, bench, face)
-        face.answer(StepAt(step, place, len(WALK), found))
-        cause = found.data.get(STOPPED)
-        if cause is not None and not RULES[StopCause(cause)].faces:
-            face.answer(Say("motion has ended for good: look at the robot, then begin the walk again", "fail"))
-            break
-    return {name: now.finding for name, now in standing(bench.folder).items() if now.finding is not None}
+        while True:
+            face.answer(StepAt(step, place, len(WALK)))
+            found = do(step, bench, face)
+            face.answer(StepAt(step, place, len(WALK), found))
+            cause = found.data.get(STOPPED)
+            if cause is not None and not RULES[StopCause(cause)].faces:
+                face.answer(Say("motion has ended for good: look at the robot, then begin the walk again", "fail"))
+                return findings(bench.folder)
+            question = f"{step.title} says no. Once it is mended: do it again, or go on without it?"
+            if found.ok is not False or face.answer(Ask(question, (AGAIN, GO_ON), default=GO_ON)) != AGAIN:
+                break
+    return findings(bench.folder)
+
+
+def findings(folder: RobotFolder) -> dict[str, Finding]:
+    """step → its newest finding, for the steps that have one."""
+    return {name: now.finding for name, now in standing(folder).items() if now.finding is not None}
+
+
+def next_step(folder: RobotFolder, *, real: bool = False) -> Standing | None:
+    """Where the walk goes on: its first step that does not stand and waits for none; None where all stand.
+
+    Args:
+        real: as `standing` has it.
+    """
+    return next((now for now in standing(folder, real=real).values() if now.state != "ok" and not now.waits_for), None)

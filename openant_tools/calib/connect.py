@@ -75,7 +75,7 @@ def connect(bench: Bench, host: Host | None = None) -> Procedure:
             problems.append(f"camera: {fault}; only what happens on the floor (Arena, learning) needs it")
         else:
             seen = f"the camera {camera}"
-            yield Say(f"the camera is {camera}, {shown}; what it must see, its tags, the Arena step finds", "ok")
+            yield Say(f"the camera is {camera}, {shown}; the Arena step looks for its tags", "ok")
 
     if not bench.virtual:
         # A virtual robot's ports are gone with it: they are named on the command line, not kept.

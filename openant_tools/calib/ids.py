@@ -120,7 +120,6 @@ def _one(
         wrong = _not_one(found, motor, motors, config) or _another(found, config, motor, named)
         if wrong is None:
             break
-        yield Say(wrong.words, "fail")
         if (yield Ask(wrong.words, (AGAIN, LEAVE), default=LEAVE)) != AGAIN:
             return wrong
         yield Hands("Take everything off the cable.", "unplug")

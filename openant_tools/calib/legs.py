@@ -74,7 +74,6 @@ def legs(bench: Bench) -> Procedure:
                 parts.done(leg.name, evidence=[vars(one) for one in found], ends_rad=ends)
                 yield Say(f"{leg.words} leg: cable, range and nudge are good", "ok")
                 break
-            yield Say(trouble, "fail")
             if (yield Ask(trouble, (AGAIN, GO_ON), default=GO_ON)) != AGAIN:
                 problems.append(f"{leg.words} leg: {trouble}")
                 break

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from openant_tools.cli.hardware import Moving, adapter_option, camera_option, imu_option
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import json_option
 from openant_tools.cli.virtual_for_command import virtual_option
 from openant_tools.numbers import number
@@ -55,10 +56,10 @@ def bringup(
       openant bringup --robot my-ant
       openant bringup --robot try-ant --virtual --yes
     """
-    from openant_tools.bringup.walk import WALK, standing, walk
+    from openant_tools.bringup.walk import WALK, next_step, standing, walk
     from openant_tools.cli.face import CommandFace
     from openant_tools.files import json_text, write_text
-    from openant_tools.procedure.step import Bench
+    from openant_tools.procedure.step import Bench, Declined
     from openant_tools.robot.folder import RobotFolder, create_robot
 
     began = time.monotonic()
@@ -76,7 +77,14 @@ def bringup(
         if hands is not None:
             hands.resume(standing(folder)["legs"].state == "ok")
         bench = Bench(folder, port, imu, camera, control)
-        walk(bench, face, again=again)
+        try:
+            walk(bench, face, again=again)
+        except (Declined, KeyboardInterrupt):
+            left = next_step(folder, real=not bench.virtual)
+            if left is not None:
+                part = "" if left.left is None else f", {left.left.words} done"
+                mention(f"left at {left.step.title}{part}; torque is off, and the same command goes on there")
+            raise
         states = standing(folder)
     red = [name for name, now in states.items() if now.state != "ok"]
     result: dict[str, Any] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import select
 import sys
 from collections.abc import Callable, Sequence
@@ -110,7 +111,7 @@ class CommandFace:
 
     def _grant(self, intent: Intent) -> bool:
         self._line(
-            f"[bold]will {escape(intent.words)}[/bold]" + (" [yellow](it moves)[/yellow]" if intent.moves else "")
+            f"[bold]will {escape(intent.words)}[/bold]" + (" [yellow](it may move)[/yellow]" if intent.moves else "")
         )
         for line in change_lines(intent.registers):
             self._line(f"    {escape(line)}")
@@ -192,6 +193,9 @@ class CommandFace:
             if self._live:
                 sys.stderr.write(f"\x1b[{self._live}A")
             for joint, value in live.values.items():
+                if not math.isfinite(value):
+                    sys.stderr.write(f"\x1b[2K  {joint:8} does not answer\n")
+                    continue
                 low, high = live.low.get(joint, value - 1), live.high.get(joint, value + 1)
                 at = round(min(max((value - low) / max(high - low, 1e-9), 0.0), 1.0) * (BAR_WIDTH - 1))
                 bar = "".join("#" if k == at else "-" for k in range(BAR_WIDTH))
