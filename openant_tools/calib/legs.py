@@ -41,7 +41,7 @@ def legs(bench: Bench) -> Procedure:
     config = bench.folder.config()
     wanted = [leg for leg in LEGS if not bench.joints or any(joint.endswith(leg.name) for joint in bench.joints)]
     problems, evidence, proven = list[str](), list[Evidence](), list[str]()
-    parts = Parts(bench.folder, "legs", [leg.name for leg in wanted], bench.joints)
+    parts = Parts(bench.folder, "legs", [leg.words for leg in wanted], bench.joints)
     if parts.before:
         yield Say(parts.words)
         words = "Go on with the next leg; those that are proven stay as they are, the torso on its stand."
@@ -53,12 +53,12 @@ def legs(bench: Bench) -> Procedure:
         yield Hands("Take every leg off the cable.", "unplug")
     with opened_bus(bench) as bus:
         wait(bus.clock, BOOT_S)
-        odd = {leg.name: _differs(bus, leg, config, parts) for leg in wanted if leg.name in parts.before}
+        odd = {leg.name: _differs(bus, leg, config, parts) for leg in wanted if leg.words in parts.before}
     for k, leg in enumerate(wanted):
-        if leg.name in parts.before:
+        if leg.words in parts.before:
             if not odd[leg.name]:
                 proven.append(leg.name)
-                evidence += [Evidence(**one) for one in parts.before[leg.name].get("evidence", ())]
+                evidence += [Evidence(**one) for one in parts.before[leg.words].get("evidence", ())]
                 continue
             yield Say(f"the {leg.words} leg is not as it was left: {odd[leg.name]}; it is done again", "warn")
         while True:
@@ -71,7 +71,7 @@ def legs(bench: Bench) -> Procedure:
             if not trouble:
                 evidence += found
                 proven.append(leg.name)
-                parts.done(leg.name, evidence=[vars(one) for one in found], ends_rad=ends)
+                parts.done(leg.words, evidence=[vars(one) for one in found], ends_rad=ends)
                 yield Say(f"{leg.words} leg: cable, range and nudge are good", "ok")
                 break
             if (yield Ask(trouble, (AGAIN, GO_ON), default=GO_ON)) != AGAIN:
@@ -98,7 +98,7 @@ def _differs(bus: Bus, leg: Leg, config: RobotConfig, parts: Parts) -> str:
             return f"{joint}: {another}"
     servos = Servos(bus, robot_servos(config, joints))
     now = in_joints(servos, servo_angles(servos)[0])
-    for joint, (low, high) in parts.before[leg.name].get("ends_rad", {}).items():
+    for joint, (low, high) in parts.before[leg.words].get("ends_rad", {}).items():
         off = (now[joint] - (low + high) / 2 + math.pi) % (2 * math.pi) - math.pi
         if abs(off) > (high - low) / 2 + SLACK_RAD:
             return f"{joint} is at {number(now[joint], 'rad', decimals=0)}, hands moved it from {span(low, high, 'rad', decimals=0)}"

@@ -83,7 +83,7 @@ def bringup(
             left = next_step(folder, real=not bench.virtual)
             if left is not None:
                 part = "" if left.left is None else f", {left.left.words} done"
-                mention(f"left at {left.step.title}{part}; torque is off, and the same command goes on there")
+                mention(f"\nleft at {left.step.title}{part}; torque is off, and the same command goes on there")
             raise
         states = standing(folder)
     red = [name for name, now in states.items() if now.state != "ok"]
