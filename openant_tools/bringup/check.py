@@ -15,6 +15,7 @@ import numpy as np
 
 from openant_tools.bringup.gap_check import gap_by_joint
 from openant_tools.calib.inventory import silence_words
+from openant_tools.calib.lost_answers import loose, lost_in
 from openant_tools.calib.sweep import FOLLOWED, JointSweep, analyse, joint_sweep_of, play_watched, sweep
 from openant_tools.calib.wires import engine_config, opened_bus, opened_imu, robot_servos
 from openant_tools.comms import messages
@@ -29,7 +30,7 @@ from openant_tools.gap.measure import measure
 from openant_tools.numbers import number, percent, span
 from openant_tools.procedure.finding import Evidence, Finding, latest
 from openant_tools.procedure.relay import relayed
-from openant_tools.procedure.step import Ask, Bench, Intent, Procedure, Progress, Say, Subroutine
+from openant_tools.procedure.step import Bench, Intent, Procedure, Progress, Say, Subroutine, confirmed
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.config import RobotConfig
@@ -37,7 +38,7 @@ from openant_tools.robot.joints import JOINTS
 from openant_tools.sysid.excitation import CommandSpace
 from openant_tools.sysid.protocols import protocol
 
-__all__ = ["changed", "check", "loose", "unjudged"]
+__all__ = ["changed", "check", "unjudged"]
 
 COMMAND = "openant check"
 #: Friction: grown by this factor and by more than the sweep repeats to. Doubled friction is far beyond both.
@@ -46,8 +47,6 @@ FRICTION_FACTOR, FRICTION_NM = 1.5, 0.012
 WEIGHT_SHARE, WEIGHT_NM = 0.15, 0.003
 #: Both stops moved by so much: the zero did. A spline is 0.79 rad.
 ZERO_RAD = 0.015
-#: Share of answers lost while the joint moves.
-LOST_SHARE = 0.004
 #: K below a servo's limit at which a session should not begin.
 COOL_K = 20.0
 #: IMU: |acc| against gravity, the body's lean on its stand, rad, and the gyro's rate at rest, rad/s.
@@ -92,7 +91,7 @@ def check(bench: Bench) -> Procedure:
     baseline = {joint: joint_sweep_of(one) for joint, one in bounds.data["sweep"].items()}
     evidence, problems, unsure = list[Evidence](), list[str](), list[str]()
     for line in START_LIST:
-        if (yield Ask(f"Before it moves: {line}. Is that so?", ("yes", "no"), default="yes")) != "yes":
+        if not (yield from confirmed(bench, f"Before it moves: {line}. Is that so?")):
             problems.append(f"not as it must be before it moves: {line} → see to it first")
     if problems:
         return _finding(problems, evidence, {})
@@ -133,7 +132,7 @@ def check(bench: Bench) -> Procedure:
     now = analyse(run, limits)
     problems += changed(baseline, now)
     unsure += unjudged(baseline, now)
-    problems += loose(_lost(run), config.bus.chain)
+    problems += loose(lost_in(run), config.bus.chain)
     problems += yield from _of_this_computer(run)
     problems += _warm_or_weak(now, config)
     for joint, one in now.items():
@@ -145,7 +144,7 @@ def check(bench: Bench) -> Procedure:
         problems.append(str(fault))
     else:
         runs.append(twitch)
-        problems += loose(_lost(twitch), config.bus.chain, problems)
+        problems += loose(lost_in(twitch), config.bus.chain, problems)
         problems += yield from _of_this_computer(twitch)
         named = {*(line.partition(":")[0] for line in problems), *(difference.joint for difference in odd)}
         problems += yield from _against_model(bench, twitch, evidence, unsure, named)
@@ -261,44 +260,6 @@ def _zero_words(joint: str, shift: float) -> str:
         f"{joint}: its zero has changed by {number(shift, 'rad', sign=True, decimals=1)} (both stops moved) → horn screw or spline; then "
         "`openant calib zeros`"
     )
-
-
-def loose(lost: Mapping[str, float], chain: Sequence[Sequence[str]], known: Sequence[str] = ()) -> list[str]:
-    """Which connector loses contact: joint → share of answers lost, by how the cables run (by legs where unknown).
-
-    Args:
-        known: what was found before; a joint that is named there is not named again.
-    """
-    cables = chain or [[f"hip_{leg}", f"knee_{leg}"] for leg in ("rr", "fr", "fl", "rl")]
-    bad = {joint for joint, share in lost.items() if share > LOST_SHARE}
-    if not bad:
-        return []
-    if len(bad) > len(lost) / 2:
-        words = f"{len(bad)} of {len(lost)} servos lose answers while they move → the power plug, or the adapter's first cable"
-        return [] if words in known else [words]
-    out = []
-    for cable in cables:
-        there = [joint for joint in cable if joint in bad]
-        if there and not any(line.startswith(f"{there[0]}:") and "connector" in line for line in known):
-            first = cable.index(there[0])
-            between = f"between {cable[first - 1]} and {there[0]}" if first else f"from the board to {there[0]}"
-            out.append(
-                f"{there[0]}: {percent(lost[there[0]], decimals=1)} of its answers were lost while it moved → a loose connector {between}"
-            )
-    return out
-
-
-def _lost(run: Run) -> dict[str, float]:
-    """Joint → share of its answers that it lost by itself, while this computer was punctual.
-
-    Servos answer one after another: one that waits in vain for the one before it is lost with it, which says nothing of its
-    own cable. Where most are lost together, it is none of theirs.
-    """
-    seen = losses(run)
-    lost = seen.lost[seen.rows] if seen.judged else np.zeros((1, len(run.joints)), bool)
-    before = np.column_stack([np.zeros(len(lost), bool), lost[:, :-1]])
-    own = lost & (~before | (lost.mean(axis=1) > 0.5)[:, None])
-    return dict(zip(run.joints, own.mean(axis=0).tolist(), strict=True))
 
 
 def _of_this_computer(run: Run) -> Subroutine[list[str]]:
@@ -451,7 +412,7 @@ def _against_model(
         return []
     config = bench.folder.config()
     model = bench.folder.model_path(config)
-    found = yield from relayed(lambda progress, notice: measure([run], model, effects=config.effects))
+    found = yield from relayed(lambda progress: measure([run], model, effects=config.effects))
     evidence.append(
         Evidence("position gap of the twitch", found.gaps.get("pos"), "rad", f"{model.name}, 0.5 s horizon")
     )

@@ -61,7 +61,7 @@ def comms_step(bench: Bench) -> Procedure:
     soaked = yield from within(
         (AT_REST, 1.0), noted(soaking, parts, minutes=length, recording=bench.folder.relative(path))
     )
-    told = yield from relayed(lambda progress, notice: diagnose_dropouts([read_run(path, need=())]))
+    told = yield from relayed(lambda progress: diagnose_dropouts([read_run(path, need=())]))
     moving = dropouts_finding(told, [bench.folder.relative(path)], COMMAND)
     if soaked.whole:
         parts.end()

@@ -39,7 +39,7 @@ def gap_check(bench: Bench) -> Procedure:
     found: list[Measurement] = []
     for model, effects in models:
         one = yield from relayed(
-            lambda progress, notice, model=model, effects=effects: measure(runs, model, effects=effects)  # type: ignore[misc]
+            lambda progress, model=model, effects=effects: measure(runs, model, effects=effects)  # type: ignore[misc]
         )
         found.append(one)
     before, after = found

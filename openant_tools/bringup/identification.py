@@ -11,8 +11,8 @@ from openant_tools.comms.state import of_robot_toml
 from openant_tools.files import known
 from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.procedure.relay import relayed, within
-from openant_tools.procedure.step import Bench, Intent, Procedure, Say
+from openant_tools.procedure.relay import passing, relayed, within
+from openant_tools.procedure.step import Bench, Event, Intent, Kept, Procedure, Say
 from openant_tools.procedure.unfinished import Parts
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.folder import NOMINAL_MODEL
@@ -62,12 +62,17 @@ def identification(bench: Bench) -> Procedure:
             engine_config(bench, imu=None),
             missing,
             robot_toml=bench.folder.config_file.read_text(encoding="utf-8"),
-            made=lambda take: parts.done(named[take.path], stamp=stamp, robot=robot),
         )
-        yield from within((0.0, RECORDED), recording)
+
+        def note(event: Event) -> Event:
+            if isinstance(event, Kept):
+                parts.done(named[event.path], stamp=stamp, robot=robot)
+            return event
+
+        yield from within((0.0, RECORDED), passing(recording, note))
     fitted, held_out = [read_run(take.path) for take in wanted], [read_run(take.path) for take in judge]
     nominal = bench.folder.path / NOMINAL_MODEL
-    fitting = relayed(lambda progress, notice: sysid.fit(fitted, nominal, held_out, progress=progress))
+    fitting = relayed(lambda progress: sysid.fit(fitted, nominal, held_out, progress=progress))
     result = yield from within((RECORDED, 1.0), fitting)
     parts.end()
     # Geared servos rub the more the more they bear, which plain MuJoCo cannot do and the environment can.
@@ -111,6 +116,7 @@ def identification(bench: Bench) -> Procedure:
         problems=()
         if closer or disagree
         else ("no fitted value predicts better than the nominal model → it stays in use",),
+        stands=True,
     )
 
 

@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from openant_tools.comms.restart import RULES, MotionStopped, StopCause
 from openant_tools.errors import BadInput, OpenAntError, StorageFault
 from openant_tools.procedure.finding import Finding, keep, latest
-from openant_tools.procedure.step import Bench, Declined, Face, Say, Step, drive
+from openant_tools.procedure.step import Ask, Bench, Declined, Face, Say, Step, StepAt, drive
 from openant_tools.procedure.unfinished import Unfinished, unfinished
 
 if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
 
-__all__ = ["BENCH", "BESIDE", "WALK", "Standing", "State", "beside", "do", "standing", "step", "walk"]
+__all__ = [
+    "BENCH",
+    "BESIDE",
+    "WALK",
+    "Standing",
+    "State",
+    "beside",
+    "do",
+    "findings",
+    "next_step",
+    "standing",
+    "step",
+    "walk",
+]
 
 #: key of a finding's data: the `StopCause` of what ended its motion
 STOPPED = "stop_cause"
+#: what one may do where a step says no
+AGAIN, GO_ON = "do it again", "go on"
 #: name → step, in order.
 WALK: Mapping[str, Step] = {
     step.name: step
@@ -257,7 +272,7 @@ class Standing:
     Attributes:
         finding: its newest; None where it has not been done.
         state: `stale` where a step that it needs has been done again since.
-        waits_for: steps that it needs and that have not said yes yet.
+        waits_for: steps that it needs and whose findings do not serve yet.
         left: how far it was when it was left in the middle; None where it was not.
         virtual: whether it said yes on a virtual robot, where that counts for nothing.
     """
@@ -299,7 +314,7 @@ def _standing(folder: RobotFolder, step: Step, found: Mapping[str, Finding | Non
         state = "stale" if newer else "ok"
         if not finding.ok:
             state = "unsure" if finding.ok is None else "failed"
-    waits = tuple(name for name in step.needs if (seen := found[name]) is None or not seen.ok)
+    waits = tuple(name for name in step.needs if (seen := found[name]) is None or not seen.serves)
     passed_over = latest(folder, step.name) if finding is None else None
     virtual = passed_over is not None and bool(passed_over.ok)
     return Standing(step, finding, state, waits, unfinished(folder, step.name), virtual)
@@ -342,15 +357,14 @@ def walk(
     face: Face,
     *,
     again: bool = False,
-    notice: Callable[[Step, Finding | None], None] = lambda step, found: None,
 ) -> dict[str, Finding]:
-    """All steps in order; those that stand are not done again, those whose needs say no are left out.
+    """All steps in order; those that stand are not done again, those whose needs do not serve are left out. The face is told
+    of each that begins, and of its finding (`StepAt`).
 
-    A stop that ends motion for good (`comms.restart`) ends the walk: what it would move next waits for a new command.
+    Whoever is asked may do a step again that says no. A stop that ends motion for good (`comms.restart`) ends the walk: what it would move next waits for a new command.
 
     Args:
         again: do every step, also those that stand.
-        notice: called with each step before it is done (None), and with its finding afterwards.
 
     Returns:
         step → its newest finding, for the steps that have one.
@@ -358,7 +372,7 @@ def walk(
     Raises:
         Declined: an intent was not granted; the walk resumes at that step.
     """
-    for name, step in WALK.items():
+    for place, (name, step) in enumerate(WALK.items(), 1):
         now = standing(bench.folder, real=not bench.virtual)[name]
         if now.state == "ok" and not again:
             continue
@@ -366,12 +380,29 @@ def walk(
             titles = ", ".join(WALK[other].title for other in now.waits_for)
             face.answer(Say(f"{step.title} is left out: it needs {titles}", "warn"))
             continue
-        notice(step, None)
-        found = do(step, bench, face)
-        notice(step, found)
-        cause = found.data.get(STOPPED)
-        if cause is not None and not RULES[StopCause(cause)].faces:
-            face.answer(Say("motion has ended for good: look at the robot, then begin the walk again", "fail"))
-            break
-    states = standing(bench.folder, real=not bench.virtual)
-    return {name: now.finding for name, now in states.items() if now.finding is not None}
+        while True:
+            face.answer(StepAt(step, place, len(WALK)))
+            found = do(step, bench, face)
+            face.answer(StepAt(step, place, len(WALK), found))
+            cause = found.data.get(STOPPED)
+            if cause is not None and not RULES[StopCause(cause)].faces:
+                face.answer(Say("motion has ended for good: look at the robot, then begin the walk again", "fail"))
+                return findings(bench.folder, real=not bench.virtual)
+            question = f"{step.title} says no. Once it is mended: do it again, or go on without it?"
+            if found.ok is not False or face.answer(Ask(question, (AGAIN, GO_ON), default=GO_ON)) != AGAIN:
+                break
+    return findings(bench.folder, real=not bench.virtual)
+
+
+def findings(folder: RobotFolder, *, real: bool = False) -> dict[str, Finding]:
+    """step → its newest finding, for the steps that have one; `real`: as `standing` has it."""
+    return {name: now.finding for name, now in standing(folder, real=real).items() if now.finding is not None}
+
+
+def next_step(folder: RobotFolder, *, real: bool = False) -> Standing | None:
+    """Where the walk goes on: its first step that does not stand and waits for none; None where all stand.
+
+    Args:
+        real: as `standing` has it.
+    """
+    return next((now for now in standing(folder, real=real).values() if now.state != "ok" and not now.waits_for), None)

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from openant_tools.calib.gyro_scale import SAME_SHARE, by_camera, old_rates
 from openant_tools.calib.sweep import play_watched
-from openant_tools.calib.wires import engine_config, rest
+from openant_tools.calib.wires import clock_of, engine_config, rest
 from openant_tools.comms import messages
 from openant_tools.comms.body_camera import CameraConfig
 from openant_tools.comms.camera import Camera, CameraInfo, CameraSettings
-from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
+from openant_tools.comms.clock import Clock
 from openant_tools.comms.doubts import other_reading
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.intrinsics import CharucoBoard, Intrinsics, calibrate
@@ -300,15 +300,8 @@ def arena(bench: Bench) -> Procedure:
         },
         problems=(*wrong, *problems),
         unsure=tuple(unsure),
+        stands=True,
     )
-
-
-def _clock(bench: Bench) -> Clock:
-    if bench.control is not None:
-        remote = VirtualControl(bench.control)
-        if remote.ask("now")["stepped"]:
-            return SteppedClock(remote)
-    return RealClock()
 
 
 def _view(bench: Bench, config: RobotConfig, where: str | int, parts: Parts) -> Subroutine[_View]:
@@ -361,7 +354,7 @@ def _look(
     bench: Bench, config: RobotConfig, where: str | int, parts: Parts, lens: Intrinsics | None = None
 ) -> Subroutine[tuple[CameraInfo, Intrinsics, dict[int, Array], list[str]]]:
     """What the camera gives, the lens unless it is known, each tag's corners (4, 2) over a few pictures, and what is odd."""
-    clock = _clock(bench)
+    clock = clock_of(bench)
     camera = Camera(CameraSettings(where, exposure=config.camera.exposure, focus=config.camera.focus), clock)
     try:
         info = camera.open()

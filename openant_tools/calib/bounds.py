@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from openant_tools.calib.lost_answers import loose, lost_in
 from openant_tools.calib.motions import LIBRARY, motion
 from openant_tools.calib.sweep import JointSweep, analyse, play_watched, sweep
 from openant_tools.calib.wires import (
@@ -28,7 +29,7 @@ from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.lateness import REMEDY, losses
 from openant_tools.comms.servos import Servos
 from openant_tools.errors import HardwareFault
-from openant_tools.numbers import number, percent, span
+from openant_tools.numbers import number, span
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Ask, Bench, Drawing, Hands, Intent, Live, Procedure, Progress, Say, Subroutine
 from openant_tools.procedure.unfinished import Parts
@@ -173,7 +174,8 @@ def bounds(bench: Bench) -> Procedure:
         evidence.append(
             Evidence(f"friction of {one.joint}", one.friction_nm, "N·m", source, most=most[JOINTS[one.joint].kind])
         )
-    problems += _sweep_words(sweeps)
+    problems += _friction_words(sweeps)
+    problems += loose(lost_in(swept), config.bus.chain)
     missed = losses(swept)
     if missed.words:
         yield Say(f"{missed.words} → {REMEDY}", "warn")
@@ -210,7 +212,7 @@ def bounds(bench: Bench) -> Procedure:
         ok,
         f"ranges of {len(ranges)} joints, bounds of {len(found)} observations from {sum(len(run.t) for run in runs)} steps",
         tuple(evidence),
-        "" if ok else "look at the joints that are named; the bounds stand and can be used",
+        "" if ok else "look at the joints that are named and run it again; until then these bounds are in use",
         COMMAND,
         data={
             "limits_rad": limits,
@@ -223,6 +225,7 @@ def bounds(bench: Bench) -> Procedure:
             "recordings": recording,
         },
         problems=tuple(problems),
+        stands=True,
     )
 
 
@@ -337,8 +340,8 @@ def _most_friction(sweeps: Mapping[str, JointSweep], kind: str) -> float | None:
     return 2 * float(np.median(list(mine.values()))) + 0.03 if mine else None
 
 
-def _sweep_words(sweeps: Mapping[str, JointSweep]) -> list[str]:
-    """What is odd already on a new robot: a joint far from the others of its kind, lost answers."""
+def _friction_words(sweeps: Mapping[str, JointSweep]) -> list[str]:
+    """What is odd already on a new robot: a joint far from the others of its kind."""
     words = []
     for kind in ("hip", "knee"):
         mine, most = _of_kind(sweeps, kind), _most_friction(sweeps, kind)
@@ -348,11 +351,6 @@ def _sweep_words(sweeps: Mapping[str, JointSweep]) -> list[str]:
             for joint, friction in mine.items()
             if most is not None and friction > most
         ]
-    words += [
-        f"{joint}: {percent(one.lost, decimals=1)} of its answers were lost while it moved → look at its cable"
-        for joint, one in sweeps.items()
-        if one.lost > 0.01
-    ]
     return words
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from openant_tools.calib.sweep import play_watched
-from openant_tools.calib.wires import BOOT_S, bare_config, journalled, opened_bus, robot_servos, wait
+from openant_tools.calib.wires import BOOT_S, bare_config, differs, journalled, opened_bus, robot_servos, wait
 from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.motion import ramp
@@ -14,7 +14,6 @@ from openant_tools.errors import BadInput
 from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import (
-    Ask,
     Bench,
     Drawing,
     Hands,
@@ -24,6 +23,7 @@ from openant_tools.procedure.step import (
     RegisterChange,
     Say,
     Subroutine,
+    confirmed,
 )
 from openant_tools.procedure.unfinished import Parts
 from openant_tools.robot.config import MotorSection
@@ -137,11 +137,9 @@ def _off_evidence(joint: str, off_rad: float | None) -> Evidence:
 def _differs(bench: Bench, motor: MotorSection) -> str:
     """What of a servo whose horn is on does not read as it was left; "" where all does."""
     with opened_bus(bench) as bus:
-        found = bus.ping(motor.id, insist=True)
-        if found is None:
-            return f"nothing answers under id {motor.id}"
-        if found.model_number != motor.servo.number:
-            return f"its model number is {found.model_number}, not {motor.servo.number}"
+        another = differs(bus, motor)
+        if another:
+            return another
         servos = robot_servos(bench.folder.config(), [motor.joint])
         mode = Servos(bus, servos).read_counts("operating_mode", motor.joint)
     return "" if mode == POSITION_MODE else f"its operating mode is {mode}, not {POSITION_MODE}"
@@ -165,7 +163,7 @@ def _one(bench: Bench, motor: MotorSection) -> Subroutine[tuple[float, str]]:
                 f"{joint}: stopped {number(off, 'rad', sign=True, decimals=0)} from its mounting angle → is the shaft blocked?",
             )
         question = f"{joint} holds. Put the horn on as drawn and drive its screw in. Done?"
-        if (yield Ask(question, ("yes", "no"), default="yes")) != "yes":
+        if not (yield from confirmed(bench, question)):
             return off, f"{joint}: no horn yet → run the step again with --joint {joint}"
         turned = _off(engine, joint) - off
         if abs(turned) > CLOSE_RAD:

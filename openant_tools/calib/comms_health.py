@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
+from openant_tools.calib.lost_answers import loose, lost_alone
 from openant_tools.calib.wires import opened_bus, robot_servos, wait
 from openant_tools.comms.bench import measure_gap, measure_rate
 from openant_tools.comms.faults import Cause
@@ -39,18 +42,18 @@ def comms_health(bench: Bench) -> Procedure:
         yield Progress(0.1, f"{CYCLES} reads at {exact(RATE_HZ)} Hz")
         delays = servos.read_all("return_delay_time")
         bus.timing = replace(bus.timing, return_delay_s=max(delays.values()) * 2e-6)
-        lost, missed, punctual = dict.fromkeys(servos.joints, 0), 0, 0
+        missed, punctual = 0, list[list[bool]]()
         bus.clock.lateness.mark()
         for _ in range(CYCLES):
             answers = bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, servos.ids)
             late = bus.clock.lateness.cycle() > LATE_S
-            punctual += not late
-            for servo, answer in zip(servos.servos, answers, strict=True):
-                if late or answer.cause is Cause.LATE:
-                    missed += not answer.ok
-                else:
-                    lost[servo.joint] += not answer.ok
+            excused = [not answer.ok and (late or answer.cause is Cause.LATE) for answer in answers]
+            missed += sum(excused)
+            if not late:
+                punctual.append([not (answer.ok or mine) for answer, mine in zip(answers, excused, strict=True)])
             wait(bus.clock, 1 / RATE_HZ)
+        rows = np.reshape(np.array(punctual, bool), (-1, len(servos.ids)))
+        lost = dict(zip(servos.joints, rows.sum(axis=0).tolist(), strict=True))
         host = bus.clock.lateness.words or "answers came late"
         yield Progress(0.5, "as fast as it goes")
         rate = measure_rate(bus, servos.ids, 2.0)
@@ -60,13 +63,10 @@ def comms_health(bench: Bench) -> Procedure:
     if missed:
         words = f"{host}: {missed} of {CYCLES * len(lost)} answers were missed by that, and say nothing of servos and cables"
         yield Say(f"{words} → {REMEDY}", "warn")
-        if punctual < CYCLES * ENOUGH:
+        if len(rows) < CYCLES * ENOUGH:
             problems.append(f"cannot judge the cables, because {words} → {REMEDY}")
-    for joint, count in lost.items():
-        if count > LOST_SHARE * punctual and punctual >= CYCLES * ENOUGH:
-            problems.append(
-                f"{joint}: {count} of {punctual} answers were lost → look at the cable before it, and at its plugs"
-            )
+    if len(rows) >= CYCLES * ENOUGH:
+        problems += loose(lost_alone(servos.joints, rows), config.bus.chain, least=LOST_SHARE, moving=False)
     if rate.hz < RATE_SHARE * rate.limit_hz and busy:
         problems.append(f"cannot judge the rate, because {host} → {REMEDY}")
     elif rate.hz < RATE_SHARE * rate.limit_hz:

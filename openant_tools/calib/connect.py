@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from openant_tools.calib.wires import opened_bus, opened_imu
+from openant_tools.calib.wires import clock_of, opened_bus, opened_imu
 from openant_tools.comms.ports import WANTED_LATENCY_MS, Host, Port, udev_rule
 from openant_tools.comms.setup import find_bus
 from openant_tools.errors import HardwareFault, OpenAntError
 from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Bench, Intent, Procedure, Progress, Say
-from openant_tools.robot.config import Provenance
+from openant_tools.robot.config import Provenance, RobotConfig
 
 __all__ = ["connect"]
 
@@ -60,8 +60,22 @@ def connect(bench: Bench, host: Host | None = None) -> Procedure:
             evidence.append(Evidence("IMU rate", found[1], "Hz", f"{found[0]} at {imu}"))
             yield Say(f"the flight controller is {found[0]}, {number(found[1], 'samples/s', decimals=0)}", "ok")
     camera = bench.camera if bench.camera is not None else config.ports.camera
+    seen = "no camera yet"
     if camera == "":
-        yield Say("no camera is named yet; the Arena step asks for it", "info")
+        yield Say(
+            "no camera is known yet: the Arena step asks for it. All steps before it go without, and so does training in simulation; "
+            "to learn on the floor the robot needs one"
+        )
+    else:
+        yield Progress(0.8, f"looking through the camera {camera}")
+        try:
+            shown = _picture_of(bench, config, camera)
+        except OpenAntError as fault:
+            seen = "the camera shows nothing"
+            problems.append(f"camera: {fault}; only what happens on the floor (Arena, learning) needs it")
+        else:
+            seen = f"the camera {camera}"
+            yield Say(f"the camera is {camera}, {shown}; the Arena step looks for its tags", "ok")
 
     if not bench.virtual:
         # A virtual robot's ports are gone with it: they are named on the command line, not kept.
@@ -72,7 +86,8 @@ def connect(bench: Bench, host: Host | None = None) -> Procedure:
         "connect",
         ok,
         f"the bus is {bus}"
-        + (f", the IMU {imu}" if imu and ok else ", the IMU does not answer" if imu else ", no IMU"),
+        + (f", the IMU {imu}" if imu and ok else ", the IMU does not answer" if imu else ", no IMU")
+        + f", {seen}",
         tuple(evidence),
         "" if ok else "mend what is listed, then run it again",
         COMMAND,
@@ -92,6 +107,22 @@ def _ask_imu(bench: Bench, port: str) -> tuple[tuple[str, float] | None, OpenAnt
             ), None
     except HardwareFault as fault:
         return None, fault
+
+
+def _picture_of(bench: Bench, config: RobotConfig, source: str | int) -> str:
+    """What a picture of the camera is like, in words.
+
+    Raises:
+        OpenAntError: none comes, or OpenCV is not installed.
+    """
+    from openant_tools.comms.camera import Camera, CameraSettings  # not without OpenCV
+
+    camera = Camera(CameraSettings(source, exposure=config.camera.exposure, focus=config.camera.focus), clock_of(bench))
+    try:
+        info = camera.open()
+    finally:
+        camera.close()
+    return f"{info.width} × {info.height} pixels"
 
 
 def _only(ports: list[Port], kind: str) -> str | None:

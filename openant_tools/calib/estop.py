@@ -49,7 +49,7 @@ def estop(bench: Bench) -> Procedure:
     seen = [one for one in seen if one.baud == baud]
     names = ", ".join(f"id {one.id} ({one.model})" for one in seen)
     yield Intent(
-        f"switch torque on where {names} stands, then stop it, twice; nothing turns",
+        f"switch torque on where {names} stands, then stop it, twice; it is not told to turn",
         tuple(RegisterChange(f"id {one.id}", "torque_enable", 0, 1, "off → on") for one in seen),
         moves=True,
     )
@@ -79,7 +79,9 @@ def estop(bench: Bench) -> Procedure:
     with opened_bus(bench, baud) as bus:
         left = [one.id for one in seen if bus.read(one.id, 64, 1) != b"\0"]
     yield Say(
-        "killed: its guardian switched torque off" if not left else f"id {', '.join(map(str, left))} kept torque",
+        "killed: torque is off all the same; a second small program, the guardian, saw to it"
+        if not left
+        else f"id {', '.join(map(str, left))} kept torque",
         "fail" if left else "ok",
     )
     problems = [f"{joint} kept torque after the stop key" for joint, value in off.items() if value]

@@ -28,6 +28,7 @@ from openant_tools.procedure.step import (
     RegisterChange,
     Say,
     Subroutine,
+    confirmed,
 )
 from openant_tools.procedure.unfinished import Parts
 from openant_tools.robot.config import MotorSection, RobotConfig
@@ -65,7 +66,10 @@ def ids(bench: Bench) -> Procedure:
         found = yield from scan_and_mend(bench, bus, COMMAND)
     if _all_named(found, motors, config):
         return _finding([motor.joint for motor in motors], motors, [], "every servo has its id already")
-    wired = not found.garbled and len(found.servos) > 1 and not any(one.clash for one in found.servos)
+    parts = Parts(bench.folder, "ids", [motor.joint for motor in motors], bench.joints)
+    wired = (
+        not parts.before and not found.garbled and len(found.servos) > 1 and not any(one.clash for one in found.servos)
+    )
     if wired:
         answer = yield Ask(
             f"{len(found.servos)} servos answer under ids of their own: rename them as they are wired, or set bare "
@@ -79,17 +83,19 @@ def ids(bench: Bench) -> Procedure:
                 found = scan(bus)
             named = [m.joint for m in motors if any((o.id, o.baud) == (m.id, config.bus.baud) for o in found.servos)]
             return _finding(named, motors, problems)
-    parts = Parts(bench.folder, "ids", [motor.joint for motor in motors], bench.joints)
     if parts.before:
         yield Say(parts.words)
+    odd = {motor.joint: _differs(found, motor, config) for motor in motors if motor.joint in parts.before}
     if found.servos or found.garbled:
         yield Hands("Take every servo off the cable; they are set up one at a time.", "unplug")
     for k, motor in enumerate(motors):
         if motor.joint in parts.before:
-            named.append(motor.joint)
-            continue
+            if not odd[motor.joint]:
+                named.append(motor.joint)
+                continue
+            yield Say(f"{motor.joint} is not as it was left: {odd[motor.joint]}; it is done again", "warn")
         yield Progress(k / len(motors), f"{motor.joint} ({k + 1} of {len(motors)})")
-        trouble = yield from _one(bench, motor, motors, config)
+        trouble = yield from _one(bench, motor, motors, config, named)
         if trouble is None:
             named.append(motor.joint)
             parts.done(motor.joint, id=motor.id)
@@ -100,9 +106,9 @@ def ids(bench: Bench) -> Procedure:
 
 
 def _one(
-    bench: Bench, motor: MotorSection, motors: Sequence[MotorSection], config: RobotConfig
+    bench: Bench, motor: MotorSection, motors: Sequence[MotorSection], config: RobotConfig, named: Sequence[str]
 ) -> Subroutine[_Wrong | None]:
-    """One servo from the box; None once it is named and has proven it."""
+    """One servo from the box; None once it is named and has proven it. `named`: joints that have their servo already."""
     words = JOINTS[motor.joint].words
     while True:
         yield Hands(
@@ -111,10 +117,9 @@ def _one(
         with opened_bus(bench) as bus:
             wait(bus.clock, BOOT_S)
             found = yield from scan_and_mend(bench, bus, COMMAND)
-        wrong = _not_one(found, motor, motors, config)
+        wrong = _not_one(found, motor, motors, config) or _another(found, config, motor, named)
         if wrong is None:
             break
-        yield Say(wrong.words, "fail")
         if (yield Ask(wrong.words, (AGAIN, LEAVE), default=LEAVE)) != AGAIN:
             return wrong
         yield Hands("Take everything off the cable.", "unplug")
@@ -149,19 +154,37 @@ def _one(
                 f"{motor.joint}: {name} reads {values[name]}, {count} was written → power it off and on and try again"
             )
     yield from nudge(bench, servos[motor.joint], config.bus.baud)
-    if (
-        yield Ask(
-            f"Did this servo, and only this one, blink and turn? It is the {words} from now on.",
-            ("yes", "no"),
-            default="yes",
-        )
-    ) != "yes":
+    seen_turning = f"Did this servo, and only this one, blink and turn? It is the {words} from now on."
+    if not (yield from confirmed(bench, seen_turning)):
         return _Wrong(
             f"{motor.joint}: id {motor.id} answered, but the servo at hand did not move → another one is on the cable, or its "
             "gear is broken"
         )
     yield Say(f"{motor.joint}: id {motor.id}, {config.bus.baud} baud, read back", "ok")
     return None
+
+
+def _differs(found: Scan, motor: MotorSection, config: RobotConfig) -> str:
+    """What of a servo that was named is not as it was left, where it is on the cable; "" where it is not, or all is."""
+    here = [one for one in found.servos if one.id == motor.id]
+    if any(one.clash for one in here):
+        return f"two servos answer under id {motor.id}"
+    baud = [one for one in here if one.baud != config.bus.baud]
+    if baud:
+        return f"id {motor.id} answers at {baud[0].baud} baud"
+    model = [one for one in here if one.model_number != motor.servo.number]
+    return f"id {motor.id} is a {model[0].model}, not a {motor.model}" if model else ""
+
+
+def _another(found: Scan, config: RobotConfig, motor: MotorSection, named: Sequence[str]) -> _Wrong | None:
+    """The servo at hand is another joint's already: it would lose its name."""
+    seen = found.servos[0]
+    owner = config.motor_with_id(seen.id)
+    if owner is None or owner.joint not in named or seen.baud != config.bus.baud:
+        return None
+    return _Wrong(
+        f"{motor.joint}: this servo has id {seen.id}, it is {owner.joint} since before → plug in one that has no name yet"
+    )
 
 
 def _not_one(found: Scan, motor: MotorSection, motors: Sequence[MotorSection], config: RobotConfig) -> _Wrong | None:
@@ -223,8 +246,8 @@ def nudge(bench: Bench, servo: Servo, baud: int, angle_rad: float = NUDGE_RAD) -
         engine.ask(messages.Ramp(end))
         engine.ask(messages.Hold(SETTLE_S))
         counts: int = engine.ask(messages.ReadRegister("present_position"))[servo.joint]
-        went = counts * RAD_PER_PULSE - float(start[0])
-        yield Live({servo.joint: went}, "rad", "nudged")
+        went = servo.to_joint(counts * RAD_PER_PULSE) - float(start[0])
+        yield Live({servo.joint: went}, "rad", "nudged by")
         engine.ask(messages.Ramp(start))
         engine.ask(messages.Hold(SETTLE_S))
     return abs(went)
@@ -243,7 +266,10 @@ def _rename(bench: Bench, found: Scan, motors: Sequence[MotorSection], config: R
         fits = [joint for joint in left if config.motors[joint].servo.number == one.model_number]
         own = config.motor_with_id(one.id)
         guess = own.joint if own is not None and own.joint in fits else fits[0] if fits else "none of them"
-        answer = yield Ask(f"Which joint is id {one.id} ({one.model})?", (*fits, "none of them"), default=guess)
+        question = f"Which joint is id {one.id} ({one.model})?"
+        if bench.virtual:
+            question += " (this robot is virtual: pretend that you see it)"
+        answer = yield Ask(question, (*fits, "none of them"), default=guess)
         if isinstance(answer, str) and answer in left:
             chosen[answer] = one
             left.remove(answer)

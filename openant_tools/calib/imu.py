@@ -292,6 +292,7 @@ def imu(bench: Bench) -> Procedure:
         },
         problems=tuple(problems),
         unsure=tuple(unsure),
+        stands=sound,
     )
 
 

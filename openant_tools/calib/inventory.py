@@ -124,6 +124,7 @@ def inventory(bench: Bench) -> Procedure:
         COMMAND,
         data={"eeprom": table, "registers": state, "accepted": [one.what for one in left], "volts": volts},
         problems=tuple(problems),
+        stands=True,
     )
 
 

@@ -8,13 +8,13 @@ import numpy as np
 
 from openant_tools.calib.bounds import Unwrapped
 from openant_tools.calib.ids import nudge
-from openant_tools.calib.wires import BOOT_S, in_joints, opened_bus, robot_servos, servo_angles, wait
+from openant_tools.calib.wires import BOOT_S, differs, in_joints, opened_bus, robot_servos, servo_angles, wait
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.faults import Cause
 from openant_tools.comms.lateness import LATE_S, REMEDY
-from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servo, Servos
+from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servos
 from openant_tools.errors import HardwareFault
-from openant_tools.numbers import number
+from openant_tools.numbers import number, span
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Ask, Bench, Hands, Intent, Live, Procedure, Progress, Say, Subroutine
 from openant_tools.procedure.unfinished import Parts
@@ -31,6 +31,8 @@ READ_S, LONGEST_S, LOST_SHARE = 3.0, 60.0, 0.005
 #: Share of the kit's range that a hand must reach at a leg that is not in its shell yet.
 RANGE_SHARE = 0.6
 NUDGE_RAD, NUDGED_RAD = 0.1, 0.04
+#: by how much further than hands have moved it a leg may hang
+SLACK_RAD = 0.1
 AGAIN, GO_ON = "try again", "go on with the next"
 
 
@@ -39,7 +41,7 @@ def legs(bench: Bench) -> Procedure:
     config = bench.folder.config()
     wanted = [leg for leg in LEGS if not bench.joints or any(joint.endswith(leg.name) for joint in bench.joints)]
     problems, evidence, proven = list[str](), list[Evidence](), list[str]()
-    parts = Parts(bench.folder, "legs", [leg.name for leg in wanted], bench.joints)
+    parts = Parts(bench.folder, "legs", [leg.words for leg in wanted], bench.joints)
     if parts.before:
         yield Say(parts.words)
         words = "Go on with the next leg; those that are proven stay as they are, the torso on its stand."
@@ -50,26 +52,28 @@ def legs(bench: Bench) -> Procedure:
         )
         yield Hands("Take every leg off the cable.", "unplug")
     with opened_bus(bench) as bus:
-        wait(bus.clock, 0.2)
+        wait(bus.clock, BOOT_S)
+        odd = {leg.name: _differs(bus, leg, config, parts) for leg in wanted if leg.words in parts.before}
     for k, leg in enumerate(wanted):
-        if leg.name in parts.before:
-            proven.append(leg.name)
-            evidence += [Evidence(**one) for one in parts.before[leg.name].get("evidence", ())]
-            continue
+        if leg.words in parts.before:
+            if not odd[leg.name]:
+                proven.append(leg.name)
+                evidence += [Evidence(**one) for one in parts.before[leg.words].get("evidence", ())]
+                continue
+            yield Say(f"the {leg.words} leg is not as it was left: {odd[leg.name]}; it is done again", "warn")
         while True:
             yield Progress(k / len(wanted), f"{leg.words} leg ({k + 1} of {len(wanted)})")
             try:
-                found = yield from _one(bench, leg, config)
+                found, ends = yield from _one(bench, leg, config)
                 trouble = ""
             except HardwareFault as fault:
-                found, trouble = [], str(fault)
+                found, ends, trouble = [], {}, str(fault)
             if not trouble:
                 evidence += found
                 proven.append(leg.name)
-                parts.done(leg.name, evidence=[vars(one) for one in found])
+                parts.done(leg.words, evidence=[vars(one) for one in found], ends_rad=ends)
                 yield Say(f"{leg.words} leg: cable, range and nudge are good", "ok")
                 break
-            yield Say(trouble, "fail")
             if (yield Ask(trouble, (AGAIN, GO_ON), default=GO_ON)) != AGAIN:
                 problems.append(f"{leg.words} leg: {trouble}")
                 break
@@ -85,27 +89,47 @@ def legs(bench: Bench) -> Procedure:
     )
 
 
-def _one(bench: Bench, leg: Leg, config: RobotConfig) -> Subroutine[list[Evidence]]:
+def _differs(bus: Bus, leg: Leg, config: RobotConfig, parts: Parts) -> str:
+    """What of a leg that was proven does not read as it was left; "" where all does."""
+    joints = [f"hip_{leg.name}", f"knee_{leg.name}"]
+    for joint in joints:
+        another = differs(bus, config.motors[joint])
+        if another:
+            return f"{joint}: {another}"
+    servos = Servos(bus, robot_servos(config, joints))
+    now = in_joints(servos, servo_angles(servos)[0])
+    for joint, (low, high) in parts.before[leg.words].get("ends_rad", {}).items():
+        off = (now[joint] - (low + high) / 2 + math.pi) % (2 * math.pi) - math.pi
+        if abs(off) > (high - low) / 2 + SLACK_RAD:
+            return f"{joint} is at {number(now[joint], 'rad', decimals=0)}, hands moved it from {span(low, high, 'rad', decimals=0)}"
+    return ""
+
+
+#: joint → between which angles hands have moved it, rad
+Ends = dict[str, tuple[float, float]]
+
+
+def _one(bench: Bench, leg: Leg, config: RobotConfig) -> Subroutine[tuple[list[Evidence], Ends]]:
     """One leg; raises HardwareFault with what is wrong with it."""
     joints = [f"hip_{leg.name}", f"knee_{leg.name}"]
     for joint in joints:
         yield Hands(f"Connect {joint}.", "plug", joint)
     with opened_bus(bench) as bus:
-        evidence = yield from _by_hand(bus, joints, config)
+        evidence, ends = yield from _by_hand(bus, joints, config)
     yield Intent(f"nudge {' and '.join(joints)} by {number(NUDGE_RAD, 'rad', decimals=0)}, gently", moves=True)
-    for joint in joints:
-        motor = config.motors[joint]
-        went = yield from nudge(bench, Servo(joint, motor.id, motor.servo), config.bus.baud, NUDGE_RAD)
+    for servo in robot_servos(config, joints):  # told from the zero that they had while hands moved them
+        joint = servo.joint
+        went = yield from nudge(bench, servo, config.bus.baud, NUDGE_RAD)
         evidence.append(Evidence(f"nudge of {joint}", went, "rad", "encoder", least=NUDGED_RAD))
         if went < NUDGED_RAD:
             raise HardwareFault(
                 f"{joint} does not follow its motor ({number(went, 'rad', decimals=1)})",
                 remedy="is its horn screwed on?",
             )
-    return evidence
+    return evidence, ends
 
 
-def _by_hand(bus: Bus, joints: list[str], config: RobotConfig) -> Subroutine[list[Evidence]]:
+def _by_hand(bus: Bus, joints: list[str], config: RobotConfig) -> Subroutine[tuple[list[Evidence], Ends]]:
     """Each joint's range and its cables, moved and wiggled by hand, torque off."""
     wait(bus.clock, BOOT_S)
     servos = Servos(bus, robot_servos(config, joints))
@@ -159,4 +183,4 @@ def _by_hand(bus: Bus, joints: list[str], config: RobotConfig) -> Subroutine[lis
                 f"{joint} turned by {number(seen, 'rad', decimals=0)} of {number(whole, 'rad', decimals=0)}",
                 remedy="is a screw or a cable in its way?",
             )
-    return evidence
+    return evidence, {joint: (min(seen), max(seen)) for joint, (_, seen) in tracks.items()}

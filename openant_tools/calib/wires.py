@@ -30,7 +30,7 @@ from openant_tools.robot.config import MotorSection, RobotConfig
 from openant_tools.robot.registers import RAD_PER_PULSE
 
 __all__ = [
-    "BOOT_S", "SETTLE_S", "bare_config", "engine_config", "heard", "in_joints", "journalled", "opened_bus", "opened_imu", "rest", "robot_servos", "servo_angles", "wait",
+    "BOOT_S", "SETTLE_S", "bare_config", "clock_of", "differs", "engine_config", "heard", "in_joints", "journalled", "opened_bus", "opened_imu", "rest", "robot_servos", "servo_angles", "wait",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -102,6 +102,15 @@ def opened_imu(bench: Bench) -> Iterator[tuple[Imu, Clock]]:
         imu.close()
 
 
+def clock_of(bench: Bench) -> Clock:
+    """The time by which the bench lives, where nothing is opened that brings its own."""
+    if bench.control is not None:
+        remote = VirtualControl(bench.control)
+        if remote.ask("now")["stepped"]:
+            return SteppedClock(remote)
+    return RealClock()
+
+
 def journalled(bus: Bus, servos: Sequence[Servo], bench: Bench, command: str) -> Servos:
     """Servos whose every EEPROM write stands in the robot's journal before it is sent."""
     journal = Journal(bench.folder.journal)
@@ -130,7 +139,7 @@ def engine_config(bench: Bench, **more: object) -> EngineConfig:
 
 
 def bare_config(bench: Bench, servos: Sequence[Servo], baud: int) -> EngineConfig:
-    """The engine's config for servos as they come: each joint's angle is the servo's own, within its one turn."""
+    """The engine's config for servos as they come, each within its one turn, with its angle told from its own zero."""
     return EngineConfig(
         port=find_bus(bench.bus, bench.folder.config()),
         servos=tuple(servos),
@@ -138,11 +147,27 @@ def bare_config(bench: Bench, servos: Sequence[Servo], baud: int) -> EngineConfi
         control=bench.control,
         # A servo may lie anywhere, and hands may turn it while it is limp.
         guards=Guards(angle_margin_rad=None),
-        limits_rad={servo.joint: (0.0, 2 * math.pi - RAD_PER_PULSE) for servo in servos},
+        limits_rad={servo.joint: _one_turn(servo) for servo in servos},
         # What is set in them is looked at when they have their ids.
         anyway=True,
         journal=str(bench.folder.journal),
     )
+
+
+def _one_turn(servo: Servo) -> tuple[float, float]:
+    """rad: the ends of a servo's one turn, at the joint."""
+    low, high = sorted(servo.to_joint(end) for end in (0.0, 2 * math.pi - RAD_PER_PULSE))
+    return low, high
+
+
+def differs(bus: Bus, motor: MotorSection) -> str:
+    """What of a servo does not read as robot.toml has it: silent, or another model; "" where it is that joint's."""
+    found = bus.ping(motor.id, insist=True)
+    if found is None:
+        return f"nothing answers under id {motor.id}"
+    if found.model_number != motor.servo.number:
+        return f"the model number under id {motor.id} is {found.model_number}, not {motor.servo.number}"
+    return ""
 
 
 def heard(engine: EngineProcess) -> Subroutine[None]:

@@ -233,6 +233,7 @@ def zeros(bench: Bench) -> Procedure:
             "swapped": owner,
         },
         problems=tuple(problems),
+        stands=True,
     )
 
 
@@ -397,7 +398,7 @@ def _nudge_all(bench: Bench, joints: tuple[str, ...]) -> Subroutine[_Nudged]:
         if math.isfinite(answer.share):
             evidence.append(
                 Evidence(
-                    f"torso turned against the nudge of {joint}", -answer.share, "share", f"by the gyro: {answer.words}"
+                    f"torso's recoil at {joint}", -answer.share, "share", f"of the nudge, by the gyro: {answer.words}"
                 )
             )
         if board_known and answer.verdict in ("contradicted", "another"):

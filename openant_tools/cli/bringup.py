@@ -56,11 +56,10 @@ def bringup(
       openant bringup --robot my-ant
       openant bringup --robot try-ant --virtual --yes
     """
-    from openant_tools.bringup.walk import WALK, standing, walk
-    from openant_tools.cli.face import CommandFace, echo_finding
+    from openant_tools.bringup.walk import WALK, next_step, standing, walk
+    from openant_tools.cli.face import CommandFace
     from openant_tools.files import json_text, write_text
-    from openant_tools.procedure.finding import Finding
-    from openant_tools.procedure.step import Bench, Step
+    from openant_tools.procedure.step import Bench, Declined
     from openant_tools.robot.folder import RobotFolder, create_robot
 
     began = time.monotonic()
@@ -78,16 +77,14 @@ def bringup(
         if hands is not None:
             hands.resume(standing(folder)["legs"].state == "ok")
         bench = Bench(folder, port, imu, camera, control)
-
-        def notice(step: Step, found: Finding | None) -> None:
-            place = list(WALK).index(step.name) + 1
-            if found is None:
-                mention(f"{place}/{len(WALK)} {step.title}")
-            else:
-                click.echo(f"{place}/{len(WALK)} {step.title}: ", nl=False)
-                echo_finding(found)
-
-        walk(bench, face, again=again, notice=notice)
+        try:
+            walk(bench, face, again=again)
+        except (Declined, KeyboardInterrupt):
+            left = next_step(folder, real=not bench.virtual)
+            if left is not None:
+                part = "" if left.left is None else f", {left.left.words} done"
+                mention(f"\nleft at {left.step.title}{part}; torque is off, and the same command goes on there")
+            raise
         states = standing(folder, real=not bench.virtual)
     red = [name for name, now in states.items() if now.state != "ok"]
     result: dict[str, Any] = {

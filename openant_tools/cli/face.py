@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import select
 import sys
 from collections.abc import Callable, Sequence
@@ -12,7 +13,7 @@ from rich.markup import escape
 from rich.prompt import Confirm, FloatPrompt, Prompt
 
 from openant_tools.cli.hardware import need_moving, need_terminal
-from openant_tools.cli.log import is_quiet
+from openant_tools.cli.log import is_quiet, mention
 from openant_tools.cli.streams import has_terminal
 from openant_tools.errors import BadInput
 from openant_tools.numbers import number, percent, span
@@ -27,6 +28,7 @@ from openant_tools.procedure.step import (
     Live,
     Progress,
     Say,
+    StepAt,
     change_lines,
 )
 
@@ -68,6 +70,12 @@ class CommandFace:
                 self._line(
                     escape(words) + (f"\n{escape(drawing)}" if drawing else "") + (f" ({picture})" if picture else "")
                 )
+            case StepAt(step, place, count, finding):
+                if finding is None:
+                    mention(f"{place}/{count} {step.title}")
+                else:
+                    click.echo(f"{place}/{count} {step.title}: ", nl=False)
+                    echo_finding(finding)
             case Live():
                 return self._show(event)
             case Intent() | Hands() | Ask():
@@ -103,7 +111,7 @@ class CommandFace:
 
     def _grant(self, intent: Intent) -> bool:
         self._line(
-            f"[bold]will {escape(intent.words)}[/bold]" + (" [yellow](it moves)[/yellow]" if intent.moves else "")
+            f"[bold]will {escape(intent.words)}[/bold]" + (" [yellow](it may move)[/yellow]" if intent.moves else "")
         )
         for line in change_lines(intent.registers):
             self._line(f"    {escape(line)}")
@@ -115,7 +123,8 @@ class CommandFace:
         return Confirm.ask("Do it?", console=self.console, default=True)
 
     def _by_hand(self, hands: Hands) -> bool:
-        self._line(f"[cyan]hands:[/cyan] {escape(hands.words)}")
+        whose = "hands" if self._hands is None else "virtual hands"
+        self._line(f"[cyan]{whose}:[/cyan] {escape(hands.words)}")
         if self._hands is not None:
             self._hands(hands)
         elif not self._yes and not hands.while_watching:
@@ -184,6 +193,9 @@ class CommandFace:
             if self._live:
                 sys.stderr.write(f"\x1b[{self._live}A")
             for joint, value in live.values.items():
+                if not math.isfinite(value):
+                    sys.stderr.write(f"\x1b[2K  {joint:8} does not answer\n")
+                    continue
                 low, high = live.low.get(joint, value - 1), live.high.get(joint, value + 1)
                 at = round(min(max((value - low) / max(high - low, 1e-9), 0.0), 1.0) * (BAR_WIDTH - 1))
                 bar = "".join("#" if k == at else "-" for k in range(BAR_WIDTH))

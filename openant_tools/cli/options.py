@@ -100,7 +100,10 @@ rate_option = click.option(
     help="Commands and reads a second.",
 )
 seconds_option = click.option(
-    "--seconds", type=POSITIVE, metavar="S", help="How long to play. Default: the protocol's own time."
+    "--seconds",
+    type=POSITIVE,
+    metavar="S",
+    help="How long to play, in all: the protocol's recordings (stand, floor) share it. Default: the protocol's own time.",
 )
 tie_option = click.option(
     "--tie",

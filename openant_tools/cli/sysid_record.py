@@ -21,7 +21,7 @@ from openant_tools.cli.hardware import (
 from openant_tools.cli.options import Number, rate_option, robot_option, seconds_option
 from openant_tools.cli.progress import BarFace, progress_bar
 from openant_tools.cli.streams import has_terminal
-from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
+from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, has_camera, placeable, placed, virtual_option
 from openant_tools.numbers import exact, number, span
 
 if TYPE_CHECKING:
@@ -138,6 +138,8 @@ def record(
         [take for take in wanted if (take.protocol.setup, take.protocol.heading_rad) == place]
         for place in dict.fromkeys((take.protocol.setup, take.protocol.heading_rad) for take in wanted)
     ]
+    if any(_looks(place[0].protocol, camera, record_pictures) for place in placements):
+        _must_know_its_tag(folder, virtual_source, everywhere=bool(camera) or record_pictures)
     # A virtual robot that is started here is put where it is needed; any other, and a real one, needs hands.
     moves_itself = virtual_source is not None and placeable(virtual_source)
     for k, place in enumerate(placements):
@@ -162,6 +164,35 @@ def record(
             _print_tracking(recorded.path)
             if record_pictures:
                 _print_pictures(recorded.path)
+
+
+def _looks(protocol: Protocol, camera: bool | None, pictures: bool) -> bool:
+    """Whether the camera is read while this is played."""
+    return pictures or (protocol.setup == "floor" if camera is None else camera)
+
+
+def _must_know_its_tag(folder: RobotFolder | None, virtual_source: str | None, *, everywhere: bool) -> None:
+    """Before anything moves: what is played last may be the first to look through the camera.
+
+    Args:
+        everywhere: whether the camera is read on the stand, too.
+
+    Raises:
+        BadInput: robot.toml does not say what the camera is to look for.
+    """
+    from openant_tools.comms.setup import camera_of_robot
+    from openant_tools.errors import BadInput
+
+    if folder is None:
+        return
+    source = VIRTUAL_DEFAULT if virtual_source is not None and has_camera(virtual_source) else None
+    try:
+        camera_of_robot(folder.config(), source)
+    except BadInput as error:
+        ways = "record without the camera (--no-camera)" + (
+            "" if everywhere else ", or on the stand alone (--setup stand)"
+        )
+        raise BadInput(error.what, where=error.where, remedy=f"{error.remedy}; or {ways}") from None
 
 
 def protocols_of(
@@ -246,7 +277,7 @@ def _record_here(
             port,
             virtual_source,
             imu=floor if imu is None else imu,
-            camera=pictures or (floor if camera is None else camera),
+            camera=_looks(wanted[0].protocol, camera, pictures),
             rate_hz=rate_hz,
             anyway=anyway,
         )

@@ -5,9 +5,24 @@ from __future__ import annotations
 
 import click
 
-from openant_tools.virtual.process import VIRTUAL_DEFAULT, clock_of_its_own, placeable, placed, virtual_robot
+from openant_tools.virtual.process import (
+    VIRTUAL_DEFAULT,
+    clock_of_its_own,
+    has_camera,
+    placeable,
+    placed,
+    virtual_robot,
+)
 
-__all__ = ["VIRTUAL_DEFAULT", "clock_of_its_own", "placeable", "placed", "virtual_option", "virtual_robot"]
+__all__ = [
+    "VIRTUAL_DEFAULT",
+    "clock_of_its_own",
+    "has_camera",
+    "placeable",
+    "placed",
+    "virtual_option",
+    "virtual_robot",
+]
 
 virtual_option = click.option(
     "--virtual",

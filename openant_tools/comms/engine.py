@@ -557,7 +557,7 @@ class Engine:
             raise BadInput(
                 "no camera sends pictures that could be recorded", remedy="look at its cable, or record without"
             )
-        extra: dict[str, Any] = {}
+        extra: dict[str, Any] = {"ids": {servo.joint: servo.id for servo in self._servos.servos}}
         if self._sensors.imu is not None:
             scales = self._sensors.imu.info
             extra["imu"] = {"gyro_counts_per_dps": scales.gyro_lsb_per_dps, "acc_counts_per_g": scales.acc_lsb_per_g}

@@ -63,7 +63,10 @@ def page() -> str:
         _LOST,
         _table(
             ("cause", "it says", "do", "to make sure"),
-            ((f"`{name}`", cause.words, cause.remedy, cause.test) for name, cause in CAUSES.items()),
+            (
+                (f"`{name}`", cause.words, cause.remedy.format(**EXAMPLE), cause.test.format(**EXAMPLE))
+                for name, cause in CAUSES.items()
+            ),
         ),
         "### A servo has switched itself off\n\nIts LED blinks, and torque cannot be switched on. `openant comms scan` shows "
         "it, `openant comms reboot` says which error it is, and refuses while its cause stands.\n",

@@ -17,6 +17,7 @@ __all__ = [
     "SIGNALS",
     "closed",
     "closing",
+    "missing",
     "part_words",
     "rest_words",
     "restart_words",
@@ -124,6 +125,11 @@ def closing(share: float) -> str:
     return "nothing" if share < 0.0 else percent(share)
 
 
+def missing(share: float) -> str:
+    """What comes of it where a share of what the improved model closes is left out."""
+    return "as much closes without it" if share < LEAST_SHARE else f"without it {percent(share)} of the gap opens again"
+
+
 def standing(found: Diagnosis, one: Found) -> str:
     """Why it is in the answer, or not."""
     if one.effect in found.refuted:
@@ -132,7 +138,7 @@ def standing(found: Diagnosis, one: Found) -> str:
         return "closest, and not enough"
     if one.effect in found.selected:
         lost = found.removal.get(one.effect)
-        return "in the improved model" + ("" if lost is None else f"; without it {closing(lost)} less closes")
+        return "in the improved model" + ("" if lost is None else f"; {missing(lost)}")
     if any(one.effect in group for group in found.ambiguous_with):
         return "these runs cannot tell"
     leads = next((other for other in found.effects if other.effect == found.verdict), None)

@@ -6,7 +6,7 @@ import math
 from typing import Any, TypeVar
 
 from openant_tools.procedure.relay import passing
-from openant_tools.procedure.step import Progress, Subroutine
+from openant_tools.procedure.step import Event, Progress, Subroutine
 from openant_tools.procedure.unfinished import Parts
 
 __all__ = ["minutes", "noted"]
@@ -23,9 +23,10 @@ def noted(work: Subroutine[T], parts: Parts, **facts: Any) -> Subroutine[T]:
     """Do the work, and note each part, with these facts, once its progress is past it; its result."""
     past = 0
 
-    def note(event: Progress) -> Progress:
+    def note(event: Event) -> Event:
         nonlocal past
-        while past < int((event.share or 0.0) * len(parts.of) + 1e-9):
+        share = event.share if isinstance(event, Progress) else None
+        while past < int((share or 0.0) * len(parts.of) + 1e-9):
             parts.done(parts.of[past], **facts)
             past += 1
         return event

@@ -97,6 +97,8 @@ class Finding:
         problems: one line each for what is not as it should be, with the joint and what to do about it.
         unsure: one line each for what could not be judged, and why.
         virtual: whether it was found on a virtual robot: it says nothing of the real one.
+        stands: whether what later steps take of it (values in robot.toml, recordings) was written and can be used, even
+            where it cannot judge all of it.
 
     Raises:
         ValueError: it says no, or that it cannot judge, and lists nothing.
@@ -114,6 +116,7 @@ class Finding:
     problems: tuple[str, ...] = ()
     unsure: tuple[str, ...] = ()
     virtual: bool = False
+    stands: bool = False
 
     def __post_init__(self) -> None:
         unknown = tuple(f"{e.name} is not known ({e.source})" for e in self.evidence if e.value is None)
@@ -138,6 +141,11 @@ class Finding:
     def lines(self) -> tuple[str, ...]:
         """What is to be read below the sentence: why it cannot judge, and what is wrong, unless the sentence says it."""
         return tuple(words for words in (*self.unsure, *self.problems) if words != self.what)
+
+    @property
+    def serves(self) -> bool:
+        """Whether the steps that need it can be done: it says yes, or what they need stands although it cannot judge."""
+        return bool(self.ok) or (self.ok is None and self.stands)
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in `findings/`."""
@@ -166,6 +174,7 @@ class Finding:
             },
             "data": known(self.data),
             "virtual": self.virtual,
+            "stands": self.stands,
         }
 
     @classmethod
@@ -190,6 +199,7 @@ class Finding:
             problems=problems,
             unsure=tuple(content.get("unsure", ())),
             virtual=bool(content.get("virtual", False)),
+            stands=bool(content.get("stands", False)),
         )
 
     def as_markdown(self) -> str:

@@ -1,4 +1,4 @@
-"""Work that reports by callbacks, as a procedure: it runs in a thread, its progress comes as events. And work as a part of a
+"""Work that reports by a callback, as a procedure: it runs in a thread, its progress comes as events. And work as a part of a
 procedure: how far it is, as a share of the whole."""
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 from typing import TypeVar
 
-from openant_tools.procedure.step import Answer, Event, Progress, Say, Subroutine
+from openant_tools.procedure.step import Answer, Event, Progress, Subroutine
 
 __all__ = ["part_of", "passing", "relayed", "within"]
 
@@ -19,10 +19,8 @@ class _Cancelled(Exception):
     """Raised inside the work, where it next reports: whatever it has open is put into order on the way out."""
 
 
-def relayed(
-    work: Callable[[Callable[[float, str], None], Callable[[str], None]], T],
-) -> Subroutine[T]:
-    """Run `work(progress, notice)` and yield what it reports; its result.
+def relayed(work: Callable[[Callable[[float, str], None]], T]) -> Subroutine[T]:
+    """Run `work(progress)` and yield what it reports; its result.
 
     A face that closes the procedure ends the work at its next report. What the work raises is raised here.
     """
@@ -34,12 +32,9 @@ def relayed(
             raise _Cancelled
         events.put(Progress(share, words))
 
-    def notice(words: str) -> None:
-        events.put(Say(words))
-
     def run() -> None:
         try:
-            outcome.append(work(progress, notice))
+            outcome.append(work(progress))
         except BaseException as error:
             failure.append(error)
         finally:
@@ -58,15 +53,12 @@ def relayed(
     return outcome[0]
 
 
-def passing(work: Subroutine[T], change: Callable[[Progress], Progress]) -> Subroutine[T]:
-    """Do the work, and pass on what it yields, its progress as `change` has it where that is a share; its result."""
+def passing(work: Subroutine[T], change: Callable[[Event], Event]) -> Subroutine[T]:
+    """Do the work, and pass on what it yields as `change` has it; its result."""
     answer: Answer = None
     try:
         while True:
-            event = work.send(answer)
-            if isinstance(event, Progress) and event.share is not None:
-                event = change(event)
-            answer = yield event
+            answer = yield change(work.send(answer))
     except StopIteration as ended:
         result: T = ended.value
         return result
@@ -77,7 +69,13 @@ def passing(work: Subroutine[T], change: Callable[[Progress], Progress]) -> Subr
 def within(part: tuple[float, float], work: Subroutine[T]) -> Subroutine[T]:
     """Do the work as this part, from share to share, of a procedure, whose progress never goes back; its result."""
     begin, end = part
-    return passing(work, lambda event: Progress(begin + (event.share or 0.0) * (end - begin), event.words))
+
+    def place(event: Event) -> Event:
+        if isinstance(event, Progress) and event.share is not None:
+            return Progress(begin + event.share * (end - begin), event.words)
+        return event
+
+    return passing(work, place)
 
 
 def part_of(

@@ -33,13 +33,16 @@ __all__ = [
     "Face",
     "Hands",
     "Intent",
+    "Kept",
     "Live",
     "Procedure",
     "Progress",
     "RegisterChange",
     "Say",
     "Step",
+    "StepAt",
     "change_lines",
+    "confirmed",
     "drive",
 ]  # fmt: skip
 
@@ -179,7 +182,28 @@ class Drawing:
     picture: Path | None = None
 
 
-Event = Progress | Say | Intent | Ask | Hands | Live | Drawing
+@dataclass(frozen=True)
+class Kept:
+    """A recording is whole: it stays, whatever becomes of what follows. No answer."""
+
+    path: Path
+
+
+@dataclass(frozen=True)
+class StepAt:
+    """A step of the walk begins; with its finding, it has ended. No answer.
+
+    Attributes:
+        place, count: the how manieth of how many.
+    """
+
+    step: Step
+    place: int
+    count: int
+    finding: Finding | None = None
+
+
+Event = Progress | Say | Intent | Ask | Hands | Live | Drawing | Kept | StepAt
 Answer = bool | str | float | None
 #: A part of a procedure, with a result of its own: `result = yield from part(...)`.
 Subroutine = Generator[Event, Answer, T]
@@ -254,6 +278,14 @@ class Bench:
         return self.control is not None
 
 
+def confirmed(bench: Bench, question: str) -> Subroutine[bool]:
+    """Ask what only eyes and hands at the robot can tell; whether it is so. Of a virtual robot it is pretended, and said."""
+    if bench.virtual:
+        yield Say(f"{question} (yes: this robot is virtual, that is pretended)")
+        return True
+    return (yield Ask(question, ("yes", "no"), default="yes")) == "yes"
+
+
 @dataclass(frozen=True)
 class Step:
     """One step of the walk.
@@ -262,7 +294,7 @@ class Step:
         name: as in `openant calib NAME` and in the names of its findings.
         title: as on the screen.
         does: one sentence.
-        needs: steps that must have said yes before; things on the table come in `table`.
+        needs: steps whose findings must serve before; things on the table come in `table`.
         table: what must be at hand.
         changes: what it writes (registers, robot.toml); "" where it changes nothing.
         moves: whether the robot moves. holds: whether torque goes on although nothing moves.

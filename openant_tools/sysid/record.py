@@ -17,7 +17,7 @@ from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.errors import BadInput
 from openant_tools.numbers import number
-from openant_tools.procedure.step import Progress, Say, Subroutine
+from openant_tools.procedure.step import Kept, Progress, Say, Subroutine
 from openant_tools.recording.run import Facts
 from openant_tools.sysid.excitation import CommandSpace, Multisine
 from openant_tools.sysid.plan_file import as_table
@@ -114,15 +114,13 @@ def record_takes(
     *,
     robot_toml: str | None = None,
     pictures: bool = False,
-    made: Callable[[Take], None] = lambda take: None,
 ) -> Subroutine[list[Recorded]]:
-    """Record one take after another, of a robot that stays where it is.
+    """Record one take after another, of a robot that stays where it is; each that is whole is said to be `Kept`.
 
     Args:
         config: the robot, see `comms.setup`.
         robot_toml: the robot's configuration as text, kept inside the recordings.
         pictures: record the overhead camera's, too.
-        made: called with each take whose recording is whole.
 
     Raises:
         HardwareFault: a guard or the stop key stopped it; the recording up to there is kept.
@@ -182,7 +180,7 @@ def record_takes(
             yield from play(protocol, take.seed, f"{protocol.name}, recording {nth} of {len(wanted)}")
             written, cycles = engine.ask(messages.StopRecording())
             done.append(Recorded(Path(written), cycles))
-            made(take)
+            yield Kept(take.path)
             past += protocol.seconds
         if wanted[-1].protocol.setup == "floor":
             # Standing, it would fall when it is let go: back to how it lay.

@@ -102,6 +102,7 @@ class Scene:
         limbs: capsules in the world, each (ax, ay, az, bx, by, bz, radius), m.
         torso_radius: m.
         velocity, rate: of the body, world axes, m/s and rad/s; they make motion blur.
+        there: whether there is a robot to be seen; loose motors lie in their box, beside the picture.
     """
 
     position: Array
@@ -110,6 +111,7 @@ class Scene:
     torso_radius: float = 0.075
     velocity: Sequence[float] = (0.0, 0.0, 0.0)
     rate: Sequence[float] = (0.0, 0.0, 0.0)
+    there: bool = True
 
     def moved(self, dt: float) -> Scene:
         """The scene `dt` later, as a rigid body that goes on as it does."""

@@ -146,6 +146,8 @@ class OverheadCamera:
 
     def _parts(self, scene: Scene) -> _Parts:
         """Outlines of shadow and robot in pixels, farthest first, and the body tag's place."""
+        if not scene.there:
+            return _Parts([], [], None, np.empty((0, 2)))
         centre = np.asarray(scene.position, float)
         tag = self._tag_plane(centre, np.asarray(scene.rotation, float))
         outlines: list[tuple[float, Array, tuple[float, float, float]]] = []

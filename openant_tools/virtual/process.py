@@ -15,10 +15,12 @@ import tomlkit
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.files import read_json
 from openant_tools.numbers import exact
+from openant_tools.optional import installed
 
 __all__ = [
     "VIRTUAL_DEFAULT",
     "clock_of_its_own",
+    "has_camera",
     "placeable",
     "placed",
     "read_ready_file",
@@ -93,6 +95,15 @@ def placeable(source: str) -> bool:
         return True
     robot = _scenario(source).get("robot", {}) if source.endswith(".toml") else None
     return isinstance(robot, dict) and robot.get("setup") != "loose" and "sealed" not in _scenario(source)
+
+
+def has_camera(source: str) -> bool:
+    """Whether the virtual robot that is meant has a camera; a sealed one counts as one that has."""
+    running = ready_file(source)
+    if running is not None:
+        return read_ready_file(running)["camera"] is not None
+    scene = {} if source == VIRTUAL_DEFAULT else _scenario(source).get("camera", {})
+    return installed("cv2") and not (isinstance(scene, dict) and scene.get("present") is False)
 
 
 @contextlib.contextmanager

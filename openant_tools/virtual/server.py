@@ -425,11 +425,12 @@ class Server:
         """Let the camera see the robot when its next exposure is due."""
         assert self._camera is not None
         body = self.world.body
-        if now >= self._camera.next_exposure and body.has_torso:
+        if now >= self._camera.next_exposure:
             velocity = body.velocity
             scene = Scene(
-                body.position, body.rotation, body.limbs(), velocity=tuple(velocity[:3]), rate=tuple(velocity[3:])
-            )
+                body.position, body.rotation, body.limbs(), velocity=tuple(velocity[:3]), rate=tuple(velocity[3:]),
+                there=body.has_torso,
+            )  # fmt: skip
             # The world looks every few milliseconds; the shutter did not wait for it.
             self._camera.expose(self.now, scene.moved(self._camera.next_exposure - now))
 

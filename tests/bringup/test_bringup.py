@@ -13,13 +13,13 @@ from builder import robot
 
 from openant_tools.bringup.passport import write_passport
 from openant_tools.bringup.persistent_robot import persistent_robot
-from openant_tools.bringup.walk import WALK, do, standing, step, walk
+from openant_tools.bringup.walk import WALK, do, next_step, standing, step, walk
 from openant_tools.cli.calib import calib
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.procedure.finding import Finding, keep
 from openant_tools.procedure.relay import relayed, within
-from openant_tools.procedure.step import Answer, Ask, Declined, Event, Intent, Progress, Say
+from openant_tools.procedure.step import Answer, Ask, Declined, Event, Intent, Progress, StepAt
 from openant_tools.robot.config import Provenance
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES
@@ -128,17 +128,44 @@ def test_a_closed_terminal_resumes_at_the_step_that_was_not_done(tmp_path):
             walk(ant.bench, Closing(ant.builder()))
         states = standing(ant.folder)
         assert [states[name].state for name in ("connect", "estop", "ids")] == ["ok", "ok", "todo"]
+        following = next_step(ant.folder)
+        assert following is not None
+        assert following.step.name == "ids", "as the command says when it is left"
         assert not any(ant.torque())
 
         class Begun(Exception):
             pass
 
-        def notice(one, finding):
-            raise Begun(one.name, finding)
+        def before(event: Event) -> None:
+            if isinstance(event, StepAt):
+                raise Begun(event.step.name, event.place, event.finding)
 
         with pytest.raises(Begun) as first:
-            walk(ant.bench, ant.builder(), notice=notice)
-        assert first.value.args == ("ids", None)
+            walk(ant.bench, ant.builder(before=before))
+        assert first.value.args == ("ids", 3, None)
+
+
+def test_a_step_that_says_no_may_be_done_again_at_once(tmp_path):
+    """Without power no servo answers; the builder is asked, switches it on, and goes on with the walk."""
+
+    class Begun(Exception):
+        pass
+
+    with robot(tmp_path / "ant", robot={"setup": "loose"}) as ant:
+        builder = ant.builder(answers={"Emergency stop says no": "do it again"})
+        does, builder.hands.do = builder.hands.do, lambda hands: None  # type: ignore[method-assign]
+
+        def before(event: Event) -> None:
+            if isinstance(event, Ask) and "says no" in event.question:
+                builder.hands.do = does  # type: ignore[method-assign]
+            if isinstance(event, StepAt) and event.step.name == "ids":
+                raise Begun
+
+        builder.before = before
+        with pytest.raises(Begun):
+            walk(ant.bench, builder)
+        told = [event.finding.ok for event in builder.events if isinstance(event, StepAt) and event.finding is not None]
+        assert told == [True, False, True]
 
 
 def test_steps_that_need_what_said_no_are_left_out_in_words(tmp_path):
@@ -161,9 +188,9 @@ def test_steps_that_need_what_said_no_are_left_out_in_words(tmp_path):
 def test_work_with_callbacks_is_a_procedure_and_ends_when_it_is_closed():
     seen, ended = [], []
 
-    def work(progress, notice):
+    def work(progress):
         try:
-            notice("begun")
+            progress(0.0, "begun")
             for k in range(1000):
                 progress(k / 1000, "working")
         finally:
@@ -173,7 +200,7 @@ def test_work_with_callbacks_is_a_procedure_and_ends_when_it_is_closed():
     procedure = relayed(work)
     seen.append(next(procedure))
     procedure.close()
-    assert seen == [Say("begun")]
+    assert seen == [Progress(0.0, "begun")]
     assert ended == [True]
     result = []
 
@@ -210,7 +237,7 @@ def test_work_that_is_a_part_tells_its_share_of_the_whole_and_is_ended_with_it()
 
 
 def test_what_the_work_raises_is_raised_by_the_procedure():
-    def work(progress, notice):
+    def work(progress):
         raise HardwareFault("it fell")
 
     with pytest.raises(HardwareFault, match="it fell"):

@@ -9,7 +9,8 @@ import pytest
 from builder import Robot, robot
 
 from openant_tools.bringup import check as check_step
-from openant_tools.bringup.check import changed, check, loose, unjudged
+from openant_tools.bringup.check import changed, check, unjudged
+from openant_tools.calib.lost_answers import loose
 from openant_tools.calib.sweep import JointSweep, analyse, joint_sweep_of, sweep
 from openant_tools.calib.wires import engine_config
 from openant_tools.errors import BadInput
@@ -77,6 +78,18 @@ def test_a_horn_on_another_spline_moves_both_stops_out_of_reach():
 def test_a_loose_connector_is_named_by_how_the_cables_run(lost, chain, where):
     (words,) = loose(dict.fromkeys(JOINT_NAMES, 0.0) | lost, chain)
     assert where in words
+
+
+def test_what_all_lose_alike_blames_no_joint_and_names_who_loses_far_more():
+    alike = {joint: 0.02 + 0.001 * k for k, joint in enumerate(JOINT_NAMES)}
+    (words,) = loose(alike, ())
+    assert not words.startswith("hip")
+    for shared in ("power plug", "supply", "adapter", "busy computer"):
+        assert shared in words
+    both = loose(alike | {"knee_fl": 0.2}, ())
+    assert both[0] == words
+    assert [line.partition(":")[0] for line in both[1:]] == ["knee_fl"]
+    assert loose(alike, (), both) == []
 
 
 def test_without_a_baseline_it_says_how_to_get_one(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import itertools
 import math
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import ClassVar
@@ -40,7 +41,7 @@ from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.intrinsics import CharucoBoard, Intrinsics
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import EepromWrite, Journal
-from openant_tools.procedure.step import Ask, Bench, Declined, Event, Hands, Intent, Live, Progress, drive
+from openant_tools.procedure.step import Ask, Bench, Declined, Event, Hands, Intent, Live, Progress, Say, drive
 from openant_tools.procedure.unfinished import Parts, unfinished
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
@@ -62,6 +63,24 @@ def test_connect_finds_bus_and_imu_and_keeps_no_port_of_a_virtual_robot(tmp_path
         assert finding.ok
         assert finding.data["imu"] == ant.bench.imu
         assert ant.folder.config().ports.bus == ""
+
+
+def test_connect_says_what_it_sees_of_the_camera_and_what_needs_one(tmp_path):
+    with robot(tmp_path / "ant", sees=True, camera={"width": 640, "height": 480}) as ant:
+        finding, builder = ant.do(connect(ant.bench))
+        assert finding.ok
+        assert finding.what.endswith(f"the camera {ant.bench.camera}")
+        assert "640 × 480 pixels" in builder.said
+        finding, builder = ant.do(connect(replace(ant.bench, camera="http://127.0.0.1:9/stream.mjpg")))
+        assert finding.ok, "all steps but the Arena go without"
+        assert finding.what.endswith("the camera shows nothing")
+        assert finding.problems[0].startswith("camera: http://127.0.0.1:9/stream.mjpg: no picture comes → ")
+        ant.builder().hands.do(Hands("", "place", setup="loose"))  # type: ignore[arg-type]
+        finding, _ = ant.do(connect(ant.bench))
+        assert finding.what.endswith(f"the camera {ant.bench.camera}"), "of loose motors it sees the floor alone"
+        finding, builder = ant.do(connect(replace(ant.bench, camera=None)))
+        assert finding.what.endswith("no camera yet")
+        assert "to learn on the floor the robot needs one" in builder.said
 
 
 def test_connect_says_where_the_servos_answer_instead_of_the_imu(tmp_path):
@@ -97,6 +116,9 @@ def test_eight_servos_from_the_box_get_their_ids_and_undo_takes_one_back(tmp_pat
         assert [ant.register(joint, "id") for joint in JOINT_NAMES] == [joint.id for joint in JOINTS.values()]
         assert {ant.register(joint, "baud_rate") for joint in JOINT_NAMES} == {3}
         assert "hip_rr: id 1 → 10" in builder.granted
+        assert not [event for event in builder.events if isinstance(event, Ask)], "nobody can see a virtual servo blink"
+        assert builder.said.count("blink and turn? It is the ") == 8
+        assert "from now on. (yes: this robot is virtual, that is pretended)" in builder.said
         assert not any(ant.torque())
         entries = Journal(ant.folder.journal).open_entries()
         assert len(entries) == 24
@@ -256,20 +278,72 @@ def test_ids_that_were_left_go_on_with_the_next_servo(tmp_path):
         assert unfinished(ant.folder, "ids") is None
 
 
+def test_a_servo_that_has_its_name_does_not_lose_it_to_the_next_joint(tmp_path):
+    """The one plugged in again by mistake, and, on the cable when the step goes on, one that reads otherwise."""
+    with robot(tmp_path / "ant", **LOOSE) as ant:
+        builder = ant.builder(mistakes={"hip_fr": "hip_rr"}, before=leave_at(Hands, "(knee_fr)"))
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(ids(ant.bench), builder)
+        assert (
+            "hip_fr: this servo has id 10, it is hip_rr since before → plug in one that has no name yet" in builder.said
+        )
+        assert ant.register("hip_rr", "id") == 10
+        assert unfinished(ant.folder, "ids").words == "2 of 8"
+        ant.server.world.servos[0].set("baud_rate", 1)
+        hands = ant.builder().hands
+        hands.do(Hands("", "plug", "hip_rr"))
+        hands.do(Hands("", "plug", "knee_rr"))
+        ant.server.world.advance(ant.server.world.now + 1.0)
+        builder = ant.builder(before=leave_at(Hands, "Plug in one servo"))
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(ids(ant.bench), builder)
+        assert not [event for event in builder.events if isinstance(event, Ask)], "one at a time is answered already"
+        assert "hip_rr is not as it was left: id 10 answers at 57600 baud; it is done again" in builder.said
+        assert "knee_rr is not as it was left" not in builder.said
+        assert "(hip_rr)" in builder.events[-1].words
+
+
+def test_legs_that_were_left_are_read_again_and_only_a_difference_reopens_one(tmp_path, brisk):
+    with robot(tmp_path / "ant") as ant:
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(legs(ant.bench), ant.builder(before=leave_at(Hands, "Connect hip_fl")))
+        assert unfinished(ant.folder, "legs").words == "2 of 4"
+        servos = dict(zip(JOINT_NAMES, ant.server.world.servos, strict=True))
+
+        def goes_on_with() -> tuple[str, str]:
+            builder = ant.builder(before=leave_at(Hands, "Connect"))
+            with pytest.raises(KeyboardInterrupt):
+                ant.do(legs(ant.bench), builder)
+            return builder.events[-1].words, builder.said
+
+        assert goes_on_with()[0] == "Connect hip_fl."
+        servos["hip_fr"].set("id", 77)
+        words, said = goes_on_with()
+        assert words == "Connect hip_fr."
+        assert "front right leg is not as it was left: hip_fr: nothing answers under id 20; it is done again" in said
+        assert "rear right leg is not" not in said
+        servos["hip_rr"].set("homing_offset", 1000)
+        words, said = goes_on_with()
+        assert words == "Connect hip_rr."
+        assert re.search("rear right leg is not as it was left: hip_rr is at 88°, hands moved it from", said)
+
+
 def test_centring_that_was_left_goes_on_where_it_was_and_reads_again_what_was_done(tmp_path):
     with robot(tmp_path / "ant", **set_up()) as ant:
         with pytest.raises(KeyboardInterrupt):
-            ant.do(centre(ant.bench), ant.builder(before=leave_at(Ask, "hip_fr holds")))
+            ant.do(centre(ant.bench), ant.builder(before=leave_at(Say, "hip_fr holds")))
         assert not any(ant.torque())
         assert unfinished(ant.folder, "centre").words == "2 of 8"
         mode = ant.server.world.servos[1].model.register("operating_mode")
         ant.server.world.servos[1].memory[mode.address] = 4  # somebody has played with knee_rr meanwhile
-        builder = ant.builder(before=leave_at(Ask, "knee_fr holds"))
+        builder = ant.builder(before=leave_at(Say, "knee_fr holds"))
         with pytest.raises(KeyboardInterrupt):
             ant.do(centre(ant.bench), builder)
         assert "it goes on at 3 of 8: hip_rr, knee_rr were done before" in builder.said
         assert "knee_rr is not as it was left: its operating mode is 4, not 3; it is done again" in builder.said
-        asked = [event.question.split()[0] for event in builder.events if isinstance(event, Ask)]
+        asked = [
+            event.words.split()[0] for event in builder.events if isinstance(event, Say) and "holds." in event.words
+        ]
         assert asked == ["knee_rr", "hip_fr", "knee_fr"]
 
 
@@ -382,6 +456,24 @@ def test_a_leg_is_watched_until_hands_have_moved_it(tmp_path):
         builder.before = late.look
         finding, _ = ant.do(legs(replace(ant.bench, joints=("hip_fl",))), builder)
         assert finding.ok, builder.said
+
+
+def test_a_leg_is_told_from_one_zero_before_and_while_its_motor_nudges_it(tmp_path):
+    """Half a turn lay between what hands and what the motor showed."""
+    by_hand, by_motor = dict[str, float](), dict[str, float]()
+
+    def look(event: Event) -> None:
+        if isinstance(event, Live) and event.angles_rad:
+            by_hand.update(event.angles_rad)
+        elif isinstance(event, Live):
+            (engine,) = EngineProcess.running
+            rows = engine.telemetry()
+            by_motor.update({joint: float(rows[0, engine.columns.index(f"pos.{joint}")]) for joint in event.values})
+
+    with robot(tmp_path / "ant") as ant:
+        finding, _ = ant.do(legs(replace(ant.bench, joints=("hip_fl",))), ant.builder(before=look))
+    assert finding.ok
+    assert by_motor == pytest.approx(by_hand, abs=0.2)
 
 
 def test_legs_are_proven_one_by_one_and_a_bad_cable_is_named(tmp_path):
@@ -716,6 +808,7 @@ def test_turns_that_fit_no_sensor_are_asked_for_again_and_not_judged(tmp_path, m
         kept = ant.folder.config()
         assert kept.provenance_of("imu.gyro_counts_per_dps") is None
         assert kept.imu.acc_counts_per_g == pytest.approx(512, rel=0.01), "what was measured is kept"
+        assert finding.serves, "and the next step can use it"
 
 
 @given(
@@ -818,7 +911,7 @@ class ShownBoard:
 def test_a_board_before_the_camera_gives_the_lens_in_the_arena_step(tmp_path, monkeypatch):
     truth, ticks = Intrinsics(800, 600, 780, 776, 405, 296), itertools.count()
     monkeypatch.setattr(arena_step, "Camera", ShownBoard)
-    monkeypatch.setattr(arena_step, "_clock", lambda bench: SimpleNamespace(now=lambda: 0.1 * next(ticks)))
+    monkeypatch.setattr(arena_step, "clock_of", lambda bench: SimpleNamespace(now=lambda: 0.1 * next(ticks)))
     bench = Bench(create_robot(tmp_path / "ant"), camera="0")
 
     class Shower:
@@ -888,3 +981,12 @@ def test_a_servo_that_loses_answers_is_named(tmp_path):
         finding, _ = ant.do(comms_health(ant.bench))
         assert not finding.ok
         assert finding.problems[0].startswith("hip_fl:")
+
+
+def test_a_bus_that_loses_answers_of_all_servos_alike_blames_no_cable_of_one(tmp_path, brisk):
+    with robot(tmp_path / "ant", fault=[{"cause": "line_noise", "byte_error": 0.001}]) as ant:
+        for step in (comms_health, bounds):
+            finding, _ = ant.do(step(ant.bench))
+            lost = [line for line in finding.problems if "answers" in line]
+            assert len(lost) == 1, finding.problems
+            assert "the power plug and the supply, the adapter and its first cable, or a busy computer" in lost[0]

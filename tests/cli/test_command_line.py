@@ -6,6 +6,7 @@ import ast
 import inspect
 import io
 import json
+import math
 import os
 import re
 import resource
@@ -25,6 +26,7 @@ import mujoco
 import numpy as np
 import pytest
 from plants import drive, pendulum, run_of, sweep
+from rich.console import Console
 
 from openant_tools.cli import face, main
 from openant_tools.cli import openant as manual
@@ -540,6 +542,16 @@ def test_enter_ends_what_is_watched_while_progress_is_told(monkeypatch: pytest.M
     assert shown.answer(watched) is True
     shown.answer(Progress(0.6, "cooling"))
     assert shown.answer(watched) is False
+
+
+def test_a_servo_that_falls_silent_while_it_is_shown_is_said_to(capsys: pytest.CaptureFixture[str]) -> None:
+    shown = CommandFace(yes=True)
+    shown.console = Console(stderr=True, force_terminal=True)
+    ends = {"hip_rr": -1.0, "knee_rr": -1.0}, {"hip_rr": 1.0, "knee_rr": 1.0}
+    shown.answer(Live({"hip_rr": 0.5, "knee_rr": math.nan}, "rad", "turning", *ends))
+    said = capsys.readouterr().err.splitlines()
+    assert "+28.6°" in said[0]
+    assert said[1].endswith("knee_rr  does not answer")
 
 
 # ---- no terminal, and no stream at all ----

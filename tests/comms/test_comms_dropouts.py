@@ -16,7 +16,7 @@ from openant_tools.blind.soak_tables import soak_table
 from openant_tools.blind.soaks import SoakAnswer, SoakMix, draw_soaks
 from openant_tools.cli.comms import comms
 from openant_tools.comms.dropouts import diagnose, measures
-from openant_tools.comms.dropouts.causes import CAUSES
+from openant_tools.comms.dropouts.causes import CAUSES, separating_test
 from openant_tools.comms.dropouts.diagnose import diagnose_dropouts, judge
 from openant_tools.comms.dropouts.log import read_log
 from openant_tools.comms.dropouts.measures import measure
@@ -215,6 +215,25 @@ def test_places_are_named() -> None:
         log = Log()
         FAULTS[cause](log)
         assert diagnose_dropouts([log.run()]).suspects[0].where == where
+
+
+@pytest.mark.parametrize("cause", ["broken_wire", "bad_servo", "bad_cable", "duplicate_id", "return_delay"])
+def test_whatever_is_to_be_done_at_a_servo_names_the_servo(cause: str) -> None:
+    """By joint and id, in the remedy, its own test, and each test that tells it from another cause."""
+    log = Log()
+    log.extra["ids"] = {joint: 10 + k for k, joint in enumerate(JOINTS)}
+    FAULTS[cause](log)
+    found = diagnose_dropouts([log.run()])
+    best = found.suspects[0]
+    for joint in (joint for joint in best.where if joint in JOINTS):
+        who = f"{joint} (id {log.extra['ids'][joint]})"  # type: ignore[index]
+        assert who in best.remedy
+        assert who in best.next_test
+        assert who in dropouts_finding(found, []).next_action
+    everything = [one for suspect in found.suspects for one in (suspect.remedy, suspect.next_test)]
+    places = {suspect.cause: ", ".join(suspect.where) for suspect in found.suspects}
+    everything += [separating_test(one, other, places) for one in CAUSES for other in CAUSES if one != other]
+    assert not [words for words in everything if re.search(r"[{}]|\b(this|these) (servo|joint)|servo concerned", words)]
 
 
 def test_what_cannot_be_told_apart_is_said_with_the_test_that_would() -> None:

@@ -30,6 +30,7 @@ from openant_tools.procedure.step import (
     Procedure,
     RegisterChange,
     Say,
+    confirmed,
     drive,
 )  # fmt: skip
 from openant_tools.robot.folder import create_robot
@@ -165,6 +166,33 @@ def test_a_step_that_cannot_judge_is_not_green_and_holds_up_what_needs_it(tmp_pa
     states = standing(folder)
     assert states["connect"].state == "unsure"
     assert "connect" in states["estop"].waits_for
+
+
+@pytest.mark.parametrize(("control", "yes"), [(None, False), ("control.sock", True)])
+def test_only_a_real_robot_is_looked_at(tmp_path, control, yes):
+    """Of a virtual one it is pretended, in words; whoever stands at a real one may say no."""
+    bench = Bench(create_robot(tmp_path / "ant"), control=control)
+    face = Scripted("no")
+    assert drive(confirmed(bench, "Did it blink?"), face) is yes
+    (event,) = face.seen
+    assert isinstance(event, Say if yes else Ask)
+    assert "pretended" in getattr(event, "words", "pretended")
+
+
+def test_what_was_written_serves_the_next_step_although_not_all_of_it_could_be_judged(tmp_path):
+    folder = create_robot(tmp_path / "ant")
+    unknown = (Evidence("friction of knee_fl", None, "N·m", "slow sweep"),)
+    finding = Finding("bounds", True, "ranges of 8 joints", unknown, "", "openant calib bounds", stands=True)
+    path = keep(finding, folder)
+    assert standing(folder)["bounds"].state == "unsure"
+    assert "bounds" not in standing(folder)["identify"].waits_for
+    told = json.loads(path.read_text())
+    assert told["stands"] is True
+    no = dict(
+        told, ok=False, problems=["knee_fl turns beyond its stop → the horn is loose"], date="2999-01-01T00:00:00Z"
+    )
+    (folder.findings / "bounds-29990101T000000Z.json").write_text(json.dumps(no))
+    assert "bounds" in standing(folder)["identify"].waits_for
 
 
 def test_the_newest_finding_of_a_step_is_found_and_a_torn_one_passed_over(tmp_path):

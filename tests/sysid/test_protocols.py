@@ -22,6 +22,7 @@ from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL, record
 from openant_tools.cli.virtual_for_command import clock_of_its_own, placeable, placed
 from openant_tools.errors import BadInput
 from openant_tools.recording.reader import read_recording
+from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.sysid.excitation import Around, InTurn, Multisine, Releases
 from openant_tools.sysid.floor_motion import LegLifts, Scrub, Twitch, WeightShifts
@@ -261,6 +262,25 @@ def test_a_virtual_robot_is_recorded_and_the_recording_says_what_was_played(tmp_
     # At rest at both ends, and following in between.
     assert np.abs(first.signal("vel")[:5]).max() < 0.1
     assert np.sqrt(np.mean((first.signal("pos") - commands) ** 2)) < 0.2
+
+
+def test_a_camera_that_looks_for_no_tag_yet_is_told_before_the_robot_moves(tmp_path: Path) -> None:
+    """The default plays on the stand first, and looks through the camera on the floor alone."""
+    folder = create_robot(tmp_path / "ant").path
+    arguments = ["--virtual", "--robot", str(folder), "--out", str(tmp_path / "run.mcap"), "--yes"]
+    result = CliRunner().invoke(record, arguments)
+    assert isinstance(result.exception, BadInput)
+    assert "camera.body_tag_id is not known yet" in str(result.exception)
+    assert "--no-camera" in str(result.exception)
+    assert "--setup stand" in str(result.exception)
+    assert not list(tmp_path.glob("*.mcap"))
+    blind = tmp_path / "blind.toml"
+    blind.write_text("[camera]\npresent = false\n")
+    quick = ["--robot", str(folder), "--seconds", "20", "--yes"]
+    for source, name, more in (([str(blind)], "blind", []), ([], "stand", ["--setup", "stand", "--protocol", "stand"])):
+        out = ["--virtual", *source, "--out", str(tmp_path / f"{name}.mcap")]
+        result = CliRunner().invoke(record, [*out, *quick, *more])
+        assert result.exit_code == 0, result.output
 
 
 def test_a_plan_is_played_with_legs_released_and_caught_then_on_the_floor(tmp_path: Path) -> None:

@@ -21,7 +21,8 @@ class DropoutCause:
     """One explanation.
 
     Attributes:
-        words: what it is, for a sentence. remedy: what ends it. test: what shows it, or rules it out.
+        words: what it is, for a sentence. remedy: what ends it. test: what shows it, or rules it out; in both `{who}` is
+            the servo, or the servos, concerned.
         prior: how common among robots with trouble, relative.
         losses: probabilities of no loss, of a few stray ones, of real ones.
         reach: kind of `Reach` → probability.
@@ -77,8 +78,8 @@ CAUSES: Mapping[str, DropoutCause] = {
     ),
     "broken_wire": DropoutCause(
         "a wire that breaks at a joint's angle",
-        "replace the cable that runs over this joint, and give it slack",
-        "bend this joint slowly by hand with torque off while `openant comms watch` runs",
+        "replace the cable that runs over {who}, and give it slack",
+        "bend {who} slowly by hand with torque off while `openant comms watch` runs",
         _LOSES,
         {"all": 0.03, "behind": 0.43, "one": 0.44, "pair": 0.03, "scattered": 0.07},
         {
@@ -88,8 +89,8 @@ CAUSES: Mapping[str, DropoutCause] = {
     ),
     "bad_servo": DropoutCause(
         "one bad servo, or its own connector",
-        "press both its plugs home, then replace the servo",
-        "swap this servo with another: does the loss go with it?",
+        "press both plugs of {who} home, then replace it",
+        "swap {who} with another servo of its model: does the loss go with it?",
         _LOSES,
         {"all": 0.01, "behind": 0.04, "one": 0.91, "pair": 0.01, "scattered": 0.03},
         {
@@ -99,8 +100,8 @@ CAUSES: Mapping[str, DropoutCause] = {
     ),
     "bad_cable": DropoutCause(
         "a bad cable or plug in the chain",
-        "replace the cable before the first servo concerned; press its plugs home",
-        "wiggle the cable before the first servo concerned, then swap it for another",
+        "replace the cable that leads to {who}; press its plugs home",
+        "wiggle the cable that leads to {who}, then swap it for another",
         _LOSES,
         {"all": 0.06, "behind": 0.77, "one": 0.1, "pair": 0.02, "scattered": 0.05},
         {
@@ -121,8 +122,8 @@ CAUSES: Mapping[str, DropoutCause] = {
     ),
     "return_delay": DropoutCause(
         "a return delay that servos still have from the factory",
-        "set Return Delay Time (9) of these servos to 0: `openant calib ids` does",
-        "read register 9 of every servo (`openant config check`)",
+        "set Return Delay Time (9) of {who} to 0: `openant calib ids` does",
+        "`openant config check` reads register 9 of {who}",
         (0.45, 0.2, 0.35),
         {"all": 0.32, "behind": 0.2, "one": 0.22, "pair": 0.06, "scattered": 0.2},
         {"crc": _SILENT, "late": (0.7, 0.55), "stairs": (6.0, 0.6), "together": (1.5, 1.5), "comb": (0.35, 9.0)},
@@ -162,8 +163,8 @@ CAUSES: Mapping[str, DropoutCause] = {
     ),
     "duplicate_id": DropoutCause(
         "two servos with one id",
-        "unplug one of the two and give it its own id: `openant calib ids`",
-        "`openant comms scan` with only one of the two plugged in",
+        "plug {who} in alone, one servo after the other, and give each its own id: `openant calib ids`",
+        "`openant comms scan` with {who} plugged in alone, one servo after the other",
         _LOSES,
         {"all": 0.02, "behind": 0.18, "one": 0.14, "pair": 0.6, "scattered": 0.06},
         {
@@ -174,7 +175,7 @@ CAUSES: Mapping[str, DropoutCause] = {
     "write_read_gap": DropoutCause(
         "reads that follow a write too closely",
         "leave 1 ms between the end of a write and the next read (bus.write_read_gap_s in robot.toml)",
-        "`openant comms bench` measures the gap that these servos need",
+        "`openant comms bench` measures the gap that the servos need",
         _LOSES,
         {"all": 0.93, "behind": 0.01, "one": 0.01, "pair": 0.01, "scattered": 0.04},
         {
@@ -184,34 +185,32 @@ CAUSES: Mapping[str, DropoutCause] = {
     ),
 }  # fmt: skip
 
+#: of two causes; `{cause}` is the servo, or the servos, that this cause is suspected at
 _TESTS: Mapping[frozenset[str], str] = {
-    frozenset(
-        ("bad_servo", "bad_cable")
-    ): "swap the cable before it first, then the servo: whichever the loss goes with",
-    frozenset(
-        ("bad_servo", "broken_wire")
-    ): "bend the joint slowly by hand with torque off, and keep still in between: "
+    frozenset(("bad_servo", "bad_cable")): "swap the cable that leads to {bad_cable} first, then the servo of {bad_servo}: "
+    "whichever the loss goes with",
+    frozenset(("bad_servo", "broken_wire")): "bend {broken_wire} slowly by hand with torque off, and keep still in between: "
     "a broken wire follows the angle, a bad servo does not",
-    frozenset(
-        ("bad_cable", "broken_wire")
-    ): "bend the joint slowly by hand with torque off, and keep still in between: "
+    frozenset(("bad_cable", "broken_wire")): "bend {broken_wire} slowly by hand with torque off, and keep still in between: "
     "a broken wire follows the angle, a bad plug does not",
     frozenset(("power_connector", "supply_weak")): "hold a heavy load without shaking, then shake without load: "
     "a weak supply follows the load, a loose connector the shaking",
-    frozenset(
-        ("power_connector", "usb_unplug")
-    ): "look at the servos' LEDs: they blink after a loss of power, not of USB",
-    frozenset(("power_connector", "bad_cable")): "read the realtime ticks: power that went resets them, data does not",
+    frozenset(("power_connector", "usb_unplug")): "look at the servos' LEDs: they blink after a loss of power, not of USB",
+    frozenset(("power_connector", "bad_cable")): "read the realtime ticks of {bad_cable}: power that went resets them, data "
+    "does not",
     frozenset(("host_stall", "usb_unplug")): "`dmesg -w` says when the adapter goes and comes",
     frozenset(("line_noise", "bad_cable")): "record at half the baud rate: noise breaks fewer answers there",
-    frozenset(("line_noise", "bad_servo")): "unplug this servo: noise stays with the others",
+    frozenset(("line_noise", "bad_servo")): "unplug {bad_servo}: noise stays with the others",
     frozenset(("write_read_gap", "line_noise")): "leave 1 ms between write and read: only the gap is cured by that",
-    frozenset(("duplicate_id", "bad_servo")): "`openant comms scan` with this servo alone on the cable",
-    frozenset(("duplicate_id", "bad_cable")): "`openant comms scan`: two servos with one id show as one",
-}
+    frozenset(("duplicate_id", "bad_servo")): "`openant comms scan` with {bad_servo} alone on the cable",
+    frozenset(("duplicate_id", "bad_cable")): "`openant comms scan` with {duplicate_id} plugged in alone, one servo after "
+    "the other: two with one id show as one",
+}  # fmt: skip
 
 
-def separating_test(one: str, other: str) -> str:
-    """What to do to tell two causes apart."""
+def separating_test(one: str, other: str, who: Mapping[str, str]) -> str:
+    """What to do to tell two causes apart; `who`: cause → the servo, or the servos, that it is suspected at."""
     own = _TESTS.get(frozenset((one, other)))
-    return own or f"{CAUSES[one].test}; {CAUSES[other].test}"
+    if own is not None:
+        return own.format(**who)
+    return "; ".join(CAUSES[cause].test.format(who=who[cause]) for cause in (one, other))

@@ -173,7 +173,9 @@ def judge(measures: Measures) -> DropoutDiagnosis:
     total = sum(math.exp(value - top) for value in logs.values())
     probability = {name: math.exp(value - top) / total for name, value in logs.items()}
     ranked = sorted(CAUSES, key=lambda name: -probability[name])
-    suspects = tuple(_suspect(name, probability, terms, measures) for name in ranked)
+    where = {name: _where(name, measures) for name in ranked}
+    who = {name: _who(where[name], measures) for name in ranked}
+    suspects = tuple(_suspect(name, where[name], who[name], probability, terms, measures) for name in ranked)
     best = ranked[0]
     verdict = "none" if probability["none"] >= max(0.5, probability[best]) else best
     if verdict != "none" and (probability[best] < NAMED or probability["unknown"] > probability[best]):
@@ -182,9 +184,9 @@ def judge(measures: Measures) -> DropoutDiagnosis:
     tied = (best, *rivals) if rivals and verdict not in ("none", "unknown") else ()
     next_test = ""
     if verdict == "unknown":
-        next_test = separating_test(*ranked[:2])
+        next_test = separating_test(best, ranked[1], who)
     elif verdict != "none":
-        next_test = separating_test(best, rivals[0]) if rivals else CAUSES[best].test
+        next_test = separating_test(best, rivals[0], who) if rivals else suspects[0].next_test
     return DropoutDiagnosis(
         verdict=verdict,
         suspects=suspects,
@@ -235,7 +237,12 @@ def _terms(cause: DropoutCause, measures: Measures) -> dict[str, float]:
 
 
 def _suspect(
-    name: str, probability: Mapping[str, float], terms: Mapping[str, Mapping[str, float]], measures: Measures
+    name: str,
+    where: tuple[str, ...],
+    who: str,
+    probability: Mapping[str, float],
+    terms: Mapping[str, Mapping[str, float]],
+    measures: Measures,
 ) -> Suspect:
     cause = CAUSES[name]
     why = []
@@ -247,7 +254,8 @@ def _suspect(
         if abs(nats) >= 0.4:
             why.append(Why(_words(mark, measures), nats))
     why.sort(key=lambda one: -one.nats)
-    return Suspect(name, _where(name, measures), probability[name], tuple(why), cause.test, cause.remedy)
+    test, remedy = cause.test.format(who=who), cause.remedy.format(who=who)
+    return Suspect(name, where, probability[name], tuple(why), test, remedy)
 
 
 def _log_sum(values: Sequence[float]) -> float:
@@ -301,6 +309,13 @@ def _where(name: str, measures: Measures) -> tuple[str, ...]:
         worst_two = sorted(concerned, key=lambda k: -reach.rate[k])[:2]
         return tuple(log.joints[k] for k in sorted(worst_two))
     return tuple(log.joints[k] for k in concerned)
+
+
+def _who(where: Sequence[str], measures: Measures) -> str:
+    """The servos of a place, each with its id where the log knows it."""
+    ids = measures.log.ids
+    names = [f"{joint} (id {ids[joint]})" if joint in ids else joint for joint in where if joint in measures.log.joints]
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names) or "every servo"
 
 
 def _first(measures: Measures) -> int:

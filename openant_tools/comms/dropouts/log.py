@@ -45,6 +45,7 @@ class BusLog:
         speed: (n,) rad/s, of all joints together. load: (n,), effort of all joints together, in A or in full loads.
         wake: (n,) s. cmd_t: (n,) s. period_s: of the loop, median.
         chain: joints as they hang on each cable; empty where nobody said.
+        ids: joint → its servo's id; empty where nobody said.
         baud: (runs,) 1/s, NaN where nobody said. facts: of each run.
         shake: (n,), what the body's sensors shake by, NaN without them.
         weight: (n,) cycles that a row stands for: more than 1 where healthy ones were thinned out.
@@ -69,6 +70,7 @@ class BusLog:
     cmd_t: Array
     period_s: float
     chain: tuple[tuple[str, ...], ...]
+    ids: Mapping[str, int]
     baud: Array
     facts: tuple[Mapping[str, Any], ...]
 
@@ -119,6 +121,7 @@ def read_log(runs: Sequence[Run]) -> BusLog:
         run=np.repeat(np.arange(len(runs)), [len(part["t"]) for part in parts]),
         period_s=float(np.median(steps)) if len(steps) else 0.02,
         chain=tuple(cable for cable in (tuple(str(j) for j in one if j in joints) for one in chain) if cable),
+        ids=next((one["ids"] for one in facts if one.get("ids")), {}),
         baud=np.array([float(one.get("baud") or np.nan) for one in facts]),
         facts=facts,
         **together,
@@ -132,6 +135,9 @@ def _bus_facts(run: Run) -> Mapping[str, Any]:
         extra["chain"] = [chain]
     elif not isinstance(chain, (list, tuple)) or not all(isinstance(one, (list, tuple)) for one in chain):
         extra["chain"] = ()
+    ids = extra.get("ids")
+    if not isinstance(ids, Mapping) or not all(type(one) is int for one in ids.values()):
+        extra["ids"] = {}
     for name in ("baud", "latency_timer_ms", "return_delay_s"):
         value = extra.get(name)
         if isinstance(value, bool) or not isinstance(value, int | float):
