@@ -33,7 +33,7 @@ def comms_step(bench: Bench) -> Procedure:
         HardwareFault: not all servos answer.
     """
     still = yield from within((0.0, AT_REST), comms_health(bench))
-    left = unfinished(bench.folder, "comms")
+    left = unfinished(bench.folder, "comms", virtual=bench.virtual)
     path = None if left is None else left.recording(bench.folder)
     length = None if left is None or path is None else next(iter(left.done.values())).get("minutes")
     resume = length is not None
@@ -45,9 +45,9 @@ def comms_step(bench: Bench) -> Procedure:
         length = float(asked) if isinstance(asked, int | float) else DEFAULT_MIN
         if length == 0.0:
             return still
-        forget(bench.folder, "comms")  # nothing of it is there any more
+        forget(bench.folder, "comms", virtual=bench.virtual)  # nothing of it is there any more
         path = bench.folder.new_recording("comms-soak")
-    parts = Parts(bench.folder, "comms", minutes(60 * length))
+    parts = Parts(bench, "comms", minutes(60 * length))
     if resume:
         yield Say(parts.words)
     yield Intent(

@@ -35,7 +35,7 @@ TAKES = ("the motion to fit", "another to judge by", "the same again", "fit")
 
 def identification(bench: Bench) -> Procedure:
     """Record, fit, write calibrated.xml; what beats nothing leaves the nominal model where it is."""
-    parts = Parts(bench.folder, "identify", TAKES)
+    parts = Parts(bench, "identify", TAKES)
     robot = _robot(bench)
     before = {name: facts for name, facts in parts.before.items() if facts["robot"] == robot}
     if before:

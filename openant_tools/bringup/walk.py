@@ -294,7 +294,7 @@ def standing(folder: RobotFolder, *, real: bool = False) -> dict[str, Standing]:
     found = {name: latest(folder, name, real=real) for name in WALK}
     # A passport tells of every step.
     return {
-        name: _standing(folder, step, found, tuple(found) if name == "passport" else step.needs)
+        name: _standing(folder, step, found, tuple(found) if name == "passport" else step.needs, real)
         for name, step in WALK.items()
     }
 
@@ -302,10 +302,12 @@ def standing(folder: RobotFolder, *, real: bool = False) -> dict[str, Standing]:
 def beside(folder: RobotFolder, step: Step, *, real: bool = False) -> Standing:
     """The same of a step that has no place in the order."""
     found = {one: latest(folder, one, real=real) for one in (*step.needs, step.name)}
-    return _standing(folder, step, found, ())  # each is a measurement by itself: no other makes it stale
+    return _standing(folder, step, found, (), real)  # each is a measurement by itself: no other makes it stale
 
 
-def _standing(folder: RobotFolder, step: Step, found: Mapping[str, Finding | None], told: Iterable[str]) -> Standing:
+def _standing(
+    folder: RobotFolder, step: Step, found: Mapping[str, Finding | None], told: Iterable[str], real: bool
+) -> Standing:
     """Args: found: step → its newest finding. told: steps of which its finding tells, so that newer ones make it stale."""
     finding = found[step.name]
     state: State = "todo"
@@ -317,7 +319,10 @@ def _standing(folder: RobotFolder, step: Step, found: Mapping[str, Finding | Non
     waits = tuple(name for name in step.needs if (seen := found[name]) is None or not seen.serves)
     passed_over = latest(folder, step.name) if finding is None else None
     virtual = passed_over is not None and bool(passed_over.ok)
-    return Standing(step, finding, state, waits, unfinished(folder, step.name), virtual)
+    left = unfinished(folder, step.name, virtual=False)
+    if not real:
+        left = unfinished(folder, step.name, virtual=True) or left
+    return Standing(step, finding, state, waits, left, virtual)
 
 
 def step(name: str) -> Step:

@@ -163,7 +163,7 @@ def arena(bench: Bench) -> Procedure:
     # What is worth knowing, what is wrong, and what could not be judged.
     problems, wrong, unsure = list[str](), list[str](), list[str]()
     values = dict[str, object]()
-    parts = Parts(bench.folder, "arena", (LENS, MOTION, CIRCLE, BACK))
+    parts = Parts(bench, "arena", (LENS, MOTION, CIRCLE, BACK))
     then = parts.before.get(LENS, {}).get("where", where)
     if then != where:
         yield Say(f"it was another camera then ({then}): lens, look and motion are made again", "warn")

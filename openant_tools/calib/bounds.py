@@ -111,7 +111,7 @@ def bounds(bench: Bench) -> Procedure:
         servos.identify()
         servos.set_torque(False)
         joints = bench.joints or JOINT_NAMES
-        parts = Parts(bench.folder, "bounds", (*joints, *RECORDED, BACK), bench.joints)
+        parts = Parts(bench, "bounds", (*joints, *RECORDED, BACK), bench.joints)
         if parts.before:
             yield Say(parts.words)
         ranges = yield from _by_hand(bus, servos, joints, parts)

@@ -72,7 +72,7 @@ def centre(bench: Bench) -> Procedure:
         yield Hands("Connect the servos, still without horns, one behind the other; 12 V on.", "plug")
         with opened_bus(bench) as bus:
             wait(bus.clock, BOOT_S)
-    parts = Parts(bench.folder, "centre", [motor.joint for motor in motors], bench.joints)
+    parts = Parts(bench, "centre", [motor.joint for motor in motors], bench.joints)
     if parts.before:
         yield Say(parts.words)
     for k, motor in enumerate(motors):

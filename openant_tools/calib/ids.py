@@ -66,7 +66,7 @@ def ids(bench: Bench) -> Procedure:
         found = yield from scan_and_mend(bench, bus, COMMAND)
     if _all_named(found, motors, config):
         return _finding([motor.joint for motor in motors], motors, [], "every servo has its id already")
-    parts = Parts(bench.folder, "ids", [motor.joint for motor in motors], bench.joints)
+    parts = Parts(bench, "ids", [motor.joint for motor in motors], bench.joints)
     wired = (
         not parts.before and not found.garbled and len(found.servos) > 1 and not any(one.clash for one in found.servos)
     )

@@ -151,7 +151,7 @@ def imu(bench: Bench) -> Procedure:
             yield Say(note, "warn")
             if "gravity decides" in note.lower() or "Gravity says" in note:
                 problems.append(f"IMU scale: {note} → {number(info.acc_lsb_per_g, 'LSB/g', decimals=0)} is used")
-        parts = Parts(bench.folder, "imu", (*(pose.words for pose in POSES), "turns"))
+        parts = Parts(bench, "imu", (*(pose.words for pose in POSES), "turns"))
         # What another board read, or with other scales, says nothing of this one.
         board = [info.uid, info.acc_lsb_per_g, info.gyro_lsb_per_dps]
         before = {words: facts["rest"] for words, facts in parts.before.items() if facts["board"] == board}

@@ -41,7 +41,7 @@ def legs(bench: Bench) -> Procedure:
     config = bench.folder.config()
     wanted = [leg for leg in LEGS if not bench.joints or any(joint.endswith(leg.name) for joint in bench.joints)]
     problems, evidence, proven = list[str](), list[Evidence](), list[str]()
-    parts = Parts(bench.folder, "legs", [leg.words for leg in wanted], bench.joints)
+    parts = Parts(bench, "legs", [leg.words for leg in wanted], bench.joints)
     if parts.before:
         yield Say(parts.words)
         words = "Go on with the next leg; those that are proven stay as they are, the torso on its stand."

@@ -63,7 +63,7 @@ def undo(bench: Bench, *, everything: bool = False) -> Procedure:
                 done += 1
     # What a step had done of its parts is not so any more.
     for command in {entry.command for entry in backwards}:
-        forget(bench.folder, command.rpartition(" ")[2])
+        forget(bench.folder, command.rpartition(" ")[2], virtual=bench.virtual)
     ok = not problems
     return Finding(
         "undo",

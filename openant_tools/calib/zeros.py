@@ -243,7 +243,7 @@ def _by_hand(bench: Bench, bus: Bus, servos: Servos, joints: tuple[str, ...]) ->
     One answer a joint: that it is held. That it is back is seen.
     """
     found: dict[str, Moved] = {}
-    parts = Parts(bench.folder, "zeros", joints, bench.joints)
+    parts = Parts(bench, "zeros", joints, bench.joints)
     if parts.before:
         yield Say(parts.words)
     first = before = servo_angles(servos)[0]

@@ -270,7 +270,7 @@ def keep(finding: Finding, folder: RobotFolder, recording: str | None = None, *,
     folder.refuse_if_held()
     finding = replace(finding, virtual=virtual)
     if finding.ok:
-        forget(folder, finding.step)
+        forget(folder, finding.step, virtual=virtual)
     stamp = finding.date.strftime("%Y%m%dT%H%M%SZ")
     path = folder.findings / f"{finding.step}-{stamp}.json"
     write_text(path, json_text(finding.as_json()))

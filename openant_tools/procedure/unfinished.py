@@ -1,7 +1,8 @@
 """What a step had done when it was left in the middle, part by part (a joint, a leg): it goes on with the next part.
 
 A part is noted once nothing of it is left to do, in the robot's folder, and the notes go when the step says yes. What of a part
-can be read again, a procedure reads again before it trusts the note.
+can be read again, a procedure reads again before it trusts the note. What was done on a virtual robot is noted apart: the real one goes on
+where it was itself.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from openant_tools.errors import BadInput
 from openant_tools.files import json_text, read_json, write_text
 
 if TYPE_CHECKING:
+    from openant_tools.procedure.step import Bench
     from openant_tools.robot.folder import RobotFolder
 
 __all__ = ["Parts", "Unfinished", "forget", "unfinished"]
@@ -61,10 +63,12 @@ class Unfinished:
         return ", ".join(names) if len(names) <= NAMED else f"{names[0]} to {names[-1]}"
 
 
-def unfinished(folder: RobotFolder, step: str) -> Unfinished | None:
-    """What a step has done of its parts, where some and not all are done; None otherwise, and where the note is none."""
+def unfinished(folder: RobotFolder, step: str, *, virtual: bool) -> Unfinished | None:
+    """What a step has done of its parts, on a virtual robot or on the real one, where some and not all are done; None otherwise, and where
+    the note is none.
+    """
     try:
-        said = read_json(_file(folder, step))
+        said = read_json(_file(folder, step, virtual))
         if said["schema"] != SCHEMA:
             return None
         of = tuple(map(str, said["of"]))
@@ -75,24 +79,24 @@ def unfinished(folder: RobotFolder, step: str) -> Unfinished | None:
     return Unfinished(of, done, date) if 0 < len(done) < len(of) else None
 
 
-def forget(folder: RobotFolder, step: str) -> None:
+def forget(folder: RobotFolder, step: str, *, virtual: bool) -> None:
     """The step begins with its first part the next time."""
-    _file(folder, step).unlink(missing_ok=True)
+    _file(folder, step, virtual).unlink(missing_ok=True)
 
 
 class Parts:
     """The parts of a step that runs.
 
     Args:
-        folder: the robot's. step: its name. of: all its parts, in order.
+        bench: of the robot. step: its name. of: all its parts, in order.
         named: joints that the builder has named: who names them wants them done anew, and nothing is noted.
     """
 
-    def __init__(self, folder: RobotFolder, step: str, of: Sequence[str], named: Sequence[str] = ()) -> None:
-        self._folder, self._step = folder, step
+    def __init__(self, bench: Bench, step: str, of: Sequence[str], named: Sequence[str] = ()) -> None:
+        self._bench, self._step = bench, step
         #: all of them, in order
         self.of = tuple(of)
-        left = None if named else unfinished(folder, step)
+        left = None if named else unfinished(bench.folder, step, virtual=bench.virtual)
         #: part → what is known of it, of those that were done before
         self.before: Mapping[str, Mapping[str, Any]] = {} if left is None or left.of != self.of else left.done
         self._left = left if self.before else None
@@ -105,11 +109,11 @@ class Parts:
         if self._kept:
             date = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
             note = {"schema": SCHEMA, "date": date.isoformat(), "of": list(self.of), "done": self._done}
-            write_text(_file(self._folder, self._step), json_text(note))
+            write_text(_file(self._bench.folder, self._step, self._bench.virtual), json_text(note))
 
     def end(self) -> None:
         """There is a result: it begins with its first part the next time, whatever the result says."""
-        forget(self._folder, self._step)
+        forget(self._bench.folder, self._step, virtual=self._bench.virtual)
 
     @property
     def words(self) -> str:
@@ -120,5 +124,5 @@ class Parts:
         return f"it goes on at {len(self.before) + 1} of {len(self.of)}: {self._left.done_words} {verb} done before"
 
 
-def _file(folder: RobotFolder, step: str) -> Path:
-    return folder.path / "unfinished" / f"{step}.json"
+def _file(folder: RobotFolder, step: str, virtual: bool) -> Path:
+    return folder.path / "unfinished" / f"{step}{'.virtual' if virtual else ''}.json"

@@ -43,12 +43,12 @@ def thermal_soak(bench: Bench) -> Procedure:
     if left is not None:
         path, plan = left
     else:
-        forget(bench.folder, "thermal")  # nothing of it is there any more
+        forget(bench.folder, "thermal", virtual=bench.virtual)  # nothing of it is there any more
         path = bench.folder.new_recording("soak")
         asked = yield Ask("Soak for how long?", unit="min", default=DEFAULT_MIN, low=SHORTEST_MIN, high=LONGEST_MIN)
         length = float(asked) if isinstance(asked, int | float) else DEFAULT_MIN
         plan = SoakPlan(load="hang", seconds=60 * length, cool_down_s=60 * COOLING_SHARE * length)
-    parts = Parts(bench.folder, "thermal", minutes(plan.seconds + plan.cool_down_s))
+    parts = Parts(bench, "thermal", minutes(plan.seconds + plan.cool_down_s))
     if resume:
         yield Say(parts.words)
     yield Intent(
@@ -74,7 +74,7 @@ def thermal_soak(bench: Bench) -> Procedure:
 
 def _left(bench: Bench) -> tuple[Path, SoakPlan] | None:
     """Recording and plan of the soak that was left in the middle; None where there is none, or none of its recording."""
-    left = unfinished(bench.folder, "thermal")
+    left = unfinished(bench.folder, "thermal", virtual=bench.virtual)
     if left is None or (path := left.recording(bench.folder)) is None:
         return None
     try:

@@ -275,7 +275,7 @@ def test_ids_that_were_left_go_on_with_the_next_servo(tmp_path):
         plugged = [event.joint for event in builder.events if isinstance(event, Hands) and event.task == "plug"]
         assert plugged == ["knee_rr", "hip_fr"]
         ant.do(undo(ant.bench))  # what is taken back is to be done again
-        assert unfinished(ant.folder, "ids") is None
+        assert unfinished(ant.folder, "ids", virtual=True) is None
 
 
 def test_a_servo_that_has_its_name_does_not_lose_it_to_the_next_joint(tmp_path):
@@ -288,7 +288,7 @@ def test_a_servo_that_has_its_name_does_not_lose_it_to_the_next_joint(tmp_path):
             "hip_fr: this servo has id 10, it is hip_rr since before → plug in one that has no name yet" in builder.said
         )
         assert ant.register("hip_rr", "id") == 10
-        assert unfinished(ant.folder, "ids").words == "2 of 8"
+        assert unfinished(ant.folder, "ids", virtual=True).words == "2 of 8"
         ant.server.world.servos[0].set("baud_rate", 1)
         hands = ant.builder().hands
         hands.do(Hands("", "plug", "hip_rr"))
@@ -307,7 +307,7 @@ def test_legs_that_were_left_are_read_again_and_only_a_difference_reopens_one(tm
     with robot(tmp_path / "ant") as ant:
         with pytest.raises(KeyboardInterrupt):
             ant.do(legs(ant.bench), ant.builder(before=leave_at(Hands, "Connect hip_fl")))
-        assert unfinished(ant.folder, "legs").words == "2 of 4"
+        assert unfinished(ant.folder, "legs", virtual=True).words == "2 of 4"
         servos = dict(zip(JOINT_NAMES, ant.server.world.servos, strict=True))
 
         def goes_on_with() -> tuple[str, str]:
@@ -333,7 +333,7 @@ def test_centring_that_was_left_goes_on_where_it_was_and_reads_again_what_was_do
         with pytest.raises(KeyboardInterrupt):
             ant.do(centre(ant.bench), ant.builder(before=leave_at(Say, "hip_fr holds")))
         assert not any(ant.torque())
-        assert unfinished(ant.folder, "centre").words == "2 of 8"
+        assert unfinished(ant.folder, "centre", virtual=True).words == "2 of 8"
         mode = ant.server.world.servos[1].model.register("operating_mode")
         ant.server.world.servos[1].memory[mode.address] = 4  # somebody has played with knee_rr meanwhile
         builder = ant.builder(before=leave_at(Say, "knee_fr holds"))
@@ -352,7 +352,7 @@ def test_zeros_and_ranges_that_were_left_go_on_with_the_next_joint(tmp_path):
         for step, name in ((zeros, "zeros"), (bounds, "bounds")):
             with pytest.raises(KeyboardInterrupt):
                 ant.do(step(ant.bench), ant.builder(before=leave_at(Hands, "Move the front right hip")))
-            assert unfinished(ant.folder, name).words == ("2 of 8" if step is zeros else "2 of 12")
+            assert unfinished(ant.folder, name, virtual=True).words == ("2 of 8" if step is zeros else "2 of 12")
         ant.folder.update({"motors.knee_rr.zero_offset_rad": 3.0}, provenance=Provenance("measured", "a test"))
         moved = {}
         for step in (zeros, bounds):
@@ -372,7 +372,7 @@ def test_bounds_that_were_left_after_the_sweep_do_not_sweep_again(tmp_path, bris
         with pytest.raises(KeyboardInterrupt):
             ant.do(bounds(ant.bench), ant.builder(before=leave_at(Progress, "trot")))
         assert not any(ant.torque())
-        assert unfinished(ant.folder, "bounds").next == "motions on the stand"
+        assert unfinished(ant.folder, "bounds", virtual=True).next == "motions on the stand"
         builder = ant.builder(before=leave_at(Hands, "Put it back"))
         with pytest.raises(KeyboardInterrupt):
             ant.do(bounds(ant.bench), builder)
@@ -380,14 +380,14 @@ def test_bounds_that_were_left_after_the_sweep_do_not_sweep_again(tmp_path, bris
         assert "then sweep" not in builder.said
         assert "goal_pwm" not in builder.said  # which the sweep had lowered
         assert shares(builder.events)[-1] > 0.6
-        assert unfinished(ant.folder, "bounds").next == "back on its stand"
+        assert unfinished(ant.folder, "bounds", virtual=True).next == "back on its stand"
         finding, builder = ant.do(bounds(ant.bench))
         assert is_dated(ant, "observation.pos.hip_rr")
         assert is_dated(ant, "motors.hip_rr.max_rad")
         assert finding.ok, finding.problems
         moving = [event.words for event in builder.events if isinstance(event, Intent) and event.moves]
         assert (moving, [e for e in builder.events if isinstance(e, Ask)]) == ([], [])
-        assert unfinished(ant.folder, "bounds") is None
+        assert unfinished(ant.folder, "bounds", virtual=True) is None
         kept = ant.recorded()
         named = {name.removeprefix("recordings/") for name in finding.data["recordings"].split(", ")}
         assert len(named) == 3
@@ -401,20 +401,20 @@ def test_an_imu_whose_poses_were_left_goes_on_with_the_next_and_another_board_be
     with robot(tmp_path / "ant") as ant:
         with pytest.raises(KeyboardInterrupt):
             ant.do(imu(ant.bench), ant.builder(before=leave_at(Hands, "left side straight down")))
-        left = unfinished(ant.folder, "imu")
+        left = unfinished(ant.folder, "imu", virtual=True)
         assert (left.words, left.next) == ("2 of 4", "left side straight down")
         builder = ant.builder(before=leave_at(Hands, "Within 3 s"))
         with pytest.raises(KeyboardInterrupt):
             ant.do(imu(ant.bench), builder)
         held = [event.words for event in builder.events if isinstance(event, Hands) and "keep still" in event.words]
         assert held == ["Hold the robot left side straight down and keep still."]
-        assert unfinished(ant.folder, "imu").next == "turns"
+        assert unfinished(ant.folder, "imu", virtual=True).next == "turns"
         note = ant.folder.path / "unfinished" / "imu.json"
         of_this_board = note.read_text()
         finding, builder = ant.do(imu(ant.bench))
         assert finding.ok, finding
         assert "keep still" not in builder.said
-        assert unfinished(ant.folder, "imu") is None
+        assert unfinished(ant.folder, "imu", virtual=True) is None
         uid = finding.data["uid"]
         note.write_text(of_this_board.replace(str(uid), "another"))
         builder = ant.builder(before=leave_at(Hands, "nose straight down"))
@@ -921,10 +921,10 @@ def test_a_board_before_the_camera_gives_the_lens_in_the_arena_step(tmp_path, mo
             return "yes" if isinstance(event, Ask) else True if isinstance(event, Hands) else None
 
     ShownBoard.views = board_views(truth, CharucoBoard(), TILTS)
-    parts = Parts(bench.folder, "arena", (arena_step.LENS, arena_step.MOTION))
+    parts = Parts(bench, "arena", (arena_step.LENS, arena_step.MOTION))
     _, lens, _, odd = drive(arena_step._look(bench, bench.folder.config(), "0", parts), Shower())
     assert odd == []
-    again = Parts(bench.folder, "arena", (arena_step.LENS, arena_step.MOTION))
+    again = Parts(bench, "arena", (arena_step.LENS, arena_step.MOTION))
     _, kept, _, _ = drive(arena_step._look(bench, bench.folder.config(), "0", again), Shower())
     assert kept == lens, "nobody shows the board a second time"
     assert (lens.source, lens.fx) == ("ChArUco board", pytest.approx(780, rel=0.01))
@@ -946,7 +946,7 @@ def test_the_arena_is_measured_by_the_robot_itself_which_moves_once_however_ofte
         for left_at in (leave_at(Intent, "stand up"), leave_at(Ask, "Radius"), leave_at(Hands, "Put it back")):
             with pytest.raises(KeyboardInterrupt):
                 ant.do(arena(ant.bench), ant.builder(before=left_at, answers={"Radius": 0.6}))
-        assert unfinished(ant.folder, "arena").words == "3 of 4"
+        assert unfinished(ant.folder, "arena", virtual=True).words == "3 of 4"
         finding, builder = ant.do(arena(ant.bench))
         assert [event.words for event in builder.events if isinstance(event, Hands)] == ["Put it back on its stand."]
         assert not [event for event in builder.events if isinstance(event, Ask | Intent)]

@@ -13,6 +13,7 @@ from textual.pilot import Pilot
 
 from openant_tools.bringup.walk import standing
 from openant_tools.procedure.finding import Evidence, Finding, keep
+from openant_tools.procedure.step import Bench
 from openant_tools.procedure.unfinished import Parts, unfinished
 from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES
@@ -109,12 +110,12 @@ def test_of_several_robots_one_is_chosen_and_a_kit_never_opens_another_kits_robo
 
 def test_what_a_step_had_done_when_it_was_left_is_said_and_offered_to_go_on_with(tmp_path: Path) -> None:
     folder = built_so_far(tmp_path / "my-ant", "connect", "estop", "ids")
-    parts = Parts(folder, "centre", JOINT_NAMES)
+    parts = Parts(Bench(folder), "centre", JOINT_NAMES)
     for joint in JOINT_NAMES[:4]:
         parts.done(joint, off_rad=0.01)
     assert continues(folder) == "Continue my-ant · 3 of 15 · next: Centring, at 5 of 8"
-    assert Parts(folder, "centre", JOINT_NAMES).words.startswith("it goes on at 5 of 8: hip_rr, knee_rr,")
-    assert not Parts(folder, "centre", ["hip_rr"], ("hip_rr",)).before  # who names a joint wants it again
+    assert Parts(Bench(folder), "centre", JOINT_NAMES).words.startswith("it goes on at 5 of 8: hip_rr, knee_rr,")
+    assert not Parts(Bench(folder), "centre", ["hip_rr"], ("hip_rr",)).before  # who names a joint wants it again
 
     async def look(app: OpenAnt, pilot: Pilot[int]) -> None:
         await until(pilot, lambda: "4 of 8 done" in screen_text(app))
@@ -126,8 +127,17 @@ def test_what_a_step_had_done_when_it_was_left_is_said_and_offered_to_go_on_with
         assert words == ["Go on at 5 of 8: hip_fl", "Begin from the first", "Back to the walk"]
 
     with_program(folder.path, look)
+    # The real robot goes on where it was left itself, whatever a virtual one did since.
+    Parts(Bench(folder, control="a virtual robot's"), "centre", JOINT_NAMES).done("hip_rr")
+    assert standing(folder, real=True)["centre"].left == unfinished(folder, "centre", virtual=False)
+    one, four = (unfinished(folder, "centre", virtual=virtual) for virtual in (True, False))
+    assert one is not None
+    assert four is not None
+    assert (one.words, four.words) == ("1 of 8", "4 of 8")
+    keep(Finding("centre", True, "8 of 8 horns are on", (), "", "x"), folder, virtual=True)
+    assert standing(folder, real=True)["centre"].left == four
     keep(Finding("centre", True, "8 of 8 horns are on", (), "", "x"), folder)
-    assert unfinished(folder, "centre") is None
+    assert unfinished(folder, "centre", virtual=False) is None
     assert standing(folder)["centre"].left is None
 
 
@@ -138,9 +148,9 @@ def test_a_note_that_is_none_is_no_note(tmp_path: Path) -> None:
     good = {"schema": "openant.unfinished/1", "date": "2026-11-20T09:30:00+00:00", "of": ["a", "b"], "done": {"a": {}}}
     for text in ("", "[]", '{"schema": 3}', json.dumps({**good, "done": 3}), json.dumps({**good, "of": ["a"]})):
         path.write_text(text)
-        assert unfinished(folder, "ids") is None
+        assert unfinished(folder, "ids", virtual=False) is None
     path.write_text(json.dumps(good))
-    left = unfinished(folder, "ids")
+    left = unfinished(folder, "ids", virtual=False)
     assert left is not None
     assert (left.next, left.words) == ("b", "1 of 2")
 

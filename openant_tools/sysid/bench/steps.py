@@ -57,14 +57,14 @@ def floor_friction(bench: Bench) -> Procedure:
         BadInput, HardwareFault: as `tilt.floor_friction`.
     """
     command, name = "openant sysid tilt", "floor-friction"
-    left = unfinished(bench.folder, name)
+    left = unfinished(bench.folder, name, virtual=bench.virtual)
     by = IMU if left else (yield Ask("What reads the plate's angle?", (IMU, PROTRACTOR), default=IMU))
     if by == IMU:
         trials = (
             (yield Ask("How often?", unit="trials", default=float(TRIALS), low=1, high=50)) if left is None else None
         )
         of = left.of if left else [f"trial {k + 1}" for k in range(int(_number(trials, TRIALS)))]
-        parts = Parts(bench.folder, name, of)
+        parts = Parts(bench, name, of)
         if parts.before:
             yield Say(parts.words)
         found = yield from tilt.floor_friction(engine_config(bench), len(of), command=command, parts=parts)

@@ -32,7 +32,7 @@ from openant_tools.procedure.step import (
     Step,
     change_lines,
 )
-from openant_tools.procedure.unfinished import forget, unfinished
+from openant_tools.procedure.unfinished import forget
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui.bars import bars
@@ -276,7 +276,7 @@ where the number lies. `l` shows the log of what was said and done instead.
     def _beginnings(self, words: str) -> list[StepChoice]:
         """To begin; where it was left in the middle, first of all to go on there."""
         folder = self.session.folder
-        left = None if folder is None else unfinished(folder, self.step.name)
+        left = None if folder is None else self._standing(folder).left
         if left is None:
             return [StepChoice(words, self.begin)]
         self.say(
@@ -293,7 +293,7 @@ where the number lies. `l` shows the log of what was said and done instead.
         if self.session.folder is not None:
             try:
                 with system_faults(where=self.session.folder.path, again="try again"):
-                    forget(self.session.folder, self.step.name)
+                    forget(self.session.folder, self.step.name, virtual=self.session.virtual is not None)
             except OpenAntError as error:
                 self.say(marked("fail", str(error)))
                 return
