@@ -83,6 +83,7 @@ def passport(folder: RobotFolder, *, real: bool = True) -> Report:
     """
     config = folder.config()
     states = standing(folder, real=real)
+    found = {name: now.finding for name, now in states.items()}
     done = _done(states)
     open_ = [now.step.title for name, now in states.items() if now.state != "ok" and name != "passport"]
     failed = any(now.state == "failed" for now in states.values())
@@ -98,14 +99,14 @@ def passport(folder: RobotFolder, *, real: bool = True) -> Report:
         f"{config.name} is measured and calibrated: all {done} steps say yes."
         if not open_
         else f"{done} of {len(WALK)} steps of {config.name} say yes; left: {left}.",
-        _portrait(folder),
+        _portrait(folder, found["identify"]),
         f"Simulated and real robot read this folder: `{config.model}` is the model, `robot.toml` the rest."
         + ("\n\n" + "\n".join(problems) if problems else ""),
         f"Do {open_[0]}: `openant bringup --robot {folder.path}`."
         if open_
         else f"Train: `{train}`. Before every session: `openant check --robot {folder.path}`.",
         "good" if not open_ else "bad" if failed else "warn",
-        _figures(folder),
+        _figures(found["gap"], found["comms"]),
     )
     report = Report(
         f"Passport of {config.name}", f"{config.kit} kit, in {folder.path.resolve()}", answer,
@@ -127,9 +128,9 @@ def passport(folder: RobotFolder, *, real: bool = True) -> Report:
             if name != "passport"
         ],
     )
-    _motors(report, folder)
-    _sensors(report, folder)
-    _observations(report, folder)
+    _motors(report, config, found["inventory"], found["bounds"])
+    _sensors(report, config, found["arena"])
+    _observations(report, folder, found["bounds"])
     report.section("Commands").code(
         f"{train}\n"
         f"openant check --robot {folder.path}        # before every session\n"
@@ -153,8 +154,7 @@ def _origins(config: RobotConfig) -> list[list[str]]:
     ]
 
 
-def _figures(folder: RobotFolder) -> list[KeyFigure]:
-    gap, comms = (standing(folder)[name].finding for name in ("gap", "comms"))
+def _figures(gap: Finding | None, comms: Finding | None) -> list[KeyFigure]:
     figures = []
     after = next((e for e in gap.evidence if e.name == "position gap, calibrated"), None) if gap else None
     if after is not None:
@@ -172,11 +172,11 @@ def _recordings(folder: RobotFolder) -> list[Path]:
     return [folder.path / name for name in named]
 
 
-def _portrait(folder: RobotFolder) -> Part | None:
+def _portrait(folder: RobotFolder, identified: Finding | None) -> Part | None:
     """The robot, and how it and its models move where that was recorded."""
     from matplotlib.image import imread
 
-    moment = _tracking(folder)
+    moment = _tracking(folder, identified)
     picture, how = robot_picture(folder.model_path())
     if moment is None:
         return None if picture is None else Picture(picture, f"The robot's model at its home pose, {how}.")
@@ -199,8 +199,7 @@ def _portrait(folder: RobotFolder) -> Part | None:
     )
 
 
-def _tracking(folder: RobotFolder) -> Moment | None:
-    identified = standing(folder)["identify"].finding
+def _tracking(folder: RobotFolder, identified: Finding | None) -> Moment | None:
     held_out = identified.data.get("held_out", []) if identified else []
     if not held_out:
         return None
@@ -210,9 +209,7 @@ def _tracking(folder: RobotFolder) -> Moment | None:
         return None
 
 
-def _motors(report: Report, folder: RobotFolder) -> None:
-    config, states = folder.config(), standing(folder)
-    inventory, bounds = states["inventory"].finding, states["bounds"].finding
+def _motors(report: Report, config: RobotConfig, inventory: Finding | None, bounds: Finding | None) -> None:
     eeprom = inventory.data.get("eeprom", {}) if inventory else {}
     swept = bounds.data.get("sweep", {}) if bounds else {}
     rows = []
@@ -236,11 +233,9 @@ def _motors(report: Report, folder: RobotFolder) -> None:
     )
 
 
-def _sensors(report: Report, folder: RobotFolder) -> None:
-    config = folder.config()
+def _sensors(report: Report, config: RobotConfig, arena: Finding | None) -> None:
     imu, camera = config.imu, config.camera
     mounted = math.sqrt(sum(x * x for x in imu.mounting_rad))
-    arena = standing(folder)["arena"].finding
     late = camera.latency_s if camera.latency_s is not None else arena.data.get("latency_s") if arena else None
     missing = "not measured"
     report.section("Sensors").table(
@@ -261,7 +256,7 @@ def _sensors(report: Report, folder: RobotFolder) -> None:
     )
 
 
-def _observations(report: Report, folder: RobotFolder) -> None:
+def _observations(report: Report, folder: RobotFolder, bounds: Finding | None) -> None:
     config = folder.config()
     if not config.observation:
         return
@@ -269,7 +264,6 @@ def _observations(report: Report, folder: RobotFolder) -> None:
         ["observation", "lowest to highest"],
         [[name, span(low, high, plots.signal_unit(name))] for name, (low, high) in config.observation.items()],
     )
-    bounds = standing(folder)["bounds"].finding
     picture = folder.path / str(bounds.data.get("picture", "")) if bounds else folder.path
     if picture.is_file():
         report.picture(picture, "What the motions for the bounds covered.")
