@@ -198,7 +198,6 @@ async def _walk(take: Callable[[OpenAnt, str], None]) -> None:
             await pilot.pause(0.2)
             take(app, "grant")
             await _choose(pilot, "Yes")
-            await _choose(pilot, "yes")
             await _choose(pilot, "Let the virtual")
             await _until(pilot, lambda: "Let the virtual robot's hands do it" in _offered(pilot))
             _plug(app, "knee_rr", "hip_fr")
