@@ -11,13 +11,12 @@ import datetime
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from openant_tools.errors import BadInput
 from openant_tools.files import json_text, read_json, write_text
 
 if TYPE_CHECKING:
-    from openant_tools.procedure.step import Bench
     from openant_tools.robot.folder import RobotFolder
 
 __all__ = ["Parts", "Unfinished", "forget", "unfinished"]
@@ -84,6 +83,16 @@ def forget(folder: RobotFolder, step: str, *, virtual: bool) -> None:
     _file(folder, step, virtual).unlink(missing_ok=True)
 
 
+class _Bench(Protocol):
+    """What of a `Bench` is asked here: findings are analysis' too, which knows no procedure."""
+
+    @property
+    def folder(self) -> RobotFolder: ...
+
+    @property
+    def virtual(self) -> bool: ...
+
+
 class Parts:
     """The parts of a step that runs.
 
@@ -92,7 +101,7 @@ class Parts:
         named: joints that the builder has named: who names them wants them done anew, and nothing is noted.
     """
 
-    def __init__(self, bench: Bench, step: str, of: Sequence[str], named: Sequence[str] = ()) -> None:
+    def __init__(self, bench: _Bench, step: str, of: Sequence[str], named: Sequence[str] = ()) -> None:
         self._bench, self._step = bench, step
         #: all of them, in order
         self.of = tuple(of)
