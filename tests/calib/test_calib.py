@@ -409,7 +409,7 @@ def test_an_imu_whose_poses_were_left_goes_on_with_the_next_and_another_board_be
         held = [event.words for event in builder.events if isinstance(event, Hands) and "keep still" in event.words]
         assert held == ["Hold the robot left side straight down and keep still."]
         assert unfinished(ant.folder, "imu", virtual=True).next == "turns"
-        note = ant.folder.path / "unfinished" / "imu.json"
+        note = ant.folder.path / "unfinished" / "imu.virtual.json"
         of_this_board = note.read_text()
         finding, builder = ant.do(imu(ant.bench))
         assert finding.ok, finding
