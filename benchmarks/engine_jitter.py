@@ -25,11 +25,11 @@ from textual.app import App, ComposeResult
 from textual.strip import Strip
 from textual.widget import Widget
 
-from openant_tools.cli.virtual_for_command import virtual_robot
 from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.setup import config_of_unknown_robot
 from openant_tools.robot.kit import home_angles
+from openant_tools.virtual.process import virtual_robot
 
 HOME = np.array(home_angles())
 FRAMES_HZ = 20

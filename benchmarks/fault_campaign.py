@@ -25,7 +25,6 @@ from typing import Any
 
 import numpy as np
 
-from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_robot
 from openant_tools.comms import messages
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.engine_process import EngineProcess
@@ -36,6 +35,7 @@ from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.kit import home_angles
+from openant_tools.virtual.process import VIRTUAL_DEFAULT, virtual_robot
 
 HOME = np.array(home_angles())
 WAVE = HOME + 0.2 * np.sin(2 * np.pi * np.arange(6000) / 100)[:, None]

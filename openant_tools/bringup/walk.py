@@ -23,7 +23,6 @@ __all__ = [
     "State",
     "beside",
     "do",
-    "findings",
     "next_step",
     "standing",
     "step",
@@ -317,7 +316,7 @@ def _standing(
         if not finding.ok:
             state = "unsure" if finding.ok is None else "failed"
     waits = tuple(name for name in step.needs if (seen := found[name]) is None or not seen.serves)
-    passed_over = latest(folder, step.name) if finding is None else None
+    passed_over = latest(folder, step.name) if real and finding is None else None
     virtual = passed_over is not None and bool(passed_over.ok)
     left = unfinished(folder, step.name, virtual=False)
     if not real:
@@ -392,14 +391,14 @@ def walk(
             cause = found.data.get(STOPPED)
             if cause is not None and not RULES[StopCause(cause)].faces:
                 face.answer(Say("motion has ended for good: look at the robot, then begin the walk again", "fail"))
-                return findings(bench.folder, real=not bench.virtual)
+                return _findings(bench.folder, real=not bench.virtual)
             question = f"{step.title} says no. Once it is mended: do it again, or go on without it?"
             if found.ok is not False or face.answer(Ask(question, (AGAIN, GO_ON), default=GO_ON)) != AGAIN:
                 break
-    return findings(bench.folder, real=not bench.virtual)
+    return _findings(bench.folder, real=not bench.virtual)
 
 
-def findings(folder: RobotFolder, *, real: bool = False) -> dict[str, Finding]:
+def _findings(folder: RobotFolder, *, real: bool = False) -> dict[str, Finding]:
     """step → its newest finding, for the steps that have one; `real`: as `standing` has it."""
     return {name: now.finding for name, now in standing(folder, real=real).items() if now.finding is not None}
 

@@ -80,7 +80,7 @@ def bench_of(
     ends with the block. No other program moves the robot or writes into its folder meanwhile."""
     from openant_tools.bringup.simulated_builder import SimulatedBuilder
     from openant_tools.cli.face import CommandFace
-    from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_robot
+    from openant_tools.virtual.process import clock_of_its_own, virtual_robot
 
     folder = _folder_of(robot)
     with contextlib.ExitStack() as stack:

@@ -18,8 +18,9 @@ from openant_tools.cli.comms_soak import soak
 from openant_tools.cli.hardware import engine_config, port_option, robot_of
 from openant_tools.cli.log import aside
 from openant_tools.cli.options import SECONDS, driver_option, json_option, robot_option
-from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_option, virtual_robot
+from openant_tools.cli.virtual_for_command import virtual_option
 from openant_tools.numbers import number, percent
+from openant_tools.virtual.process import clock_of_its_own, virtual_robot
 
 if TYPE_CHECKING:
     from rich.console import Console

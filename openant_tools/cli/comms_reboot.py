@@ -10,7 +10,8 @@ import click
 from openant_tools.cli.hardware import port_option, robot_of
 from openant_tools.cli.log import command_line
 from openant_tools.cli.options import json_option, robot_option
-from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_option, virtual_robot
+from openant_tools.cli.virtual_for_command import virtual_option
+from openant_tools.virtual.process import clock_of_its_own, virtual_robot
 
 __all__ = ["reboot"]
 

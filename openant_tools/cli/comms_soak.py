@@ -11,8 +11,9 @@ from openant_tools.cli.hardware import Moving, anyway_option, engine_config, may
 from openant_tools.cli.log import mention
 from openant_tools.cli.options import MINUTES, json_option, rate_option, robot_option
 from openant_tools.cli.progress import BarFace, progress_bar
-from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option
+from openant_tools.cli.virtual_for_command import virtual_option
 from openant_tools.numbers import number, percent
+from openant_tools.virtual.process import VIRTUAL_DEFAULT
 
 __all__ = ["soak"]
 

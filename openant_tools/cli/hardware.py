@@ -12,8 +12,8 @@ import click
 
 from openant_tools.cli.leaving import MOVES, end_with_the_terminal
 from openant_tools.cli.streams import has_terminal
-from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_robot
 from openant_tools.errors import BadInput
+from openant_tools.virtual.process import clock_of_its_own, virtual_robot
 
 if TYPE_CHECKING:
     from openant_tools.comms.messages import EngineConfig

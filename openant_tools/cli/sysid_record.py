@@ -21,8 +21,9 @@ from openant_tools.cli.hardware import (
 from openant_tools.cli.options import Number, rate_option, robot_option, seconds_option
 from openant_tools.cli.progress import BarFace, progress_bar
 from openant_tools.cli.streams import has_terminal
-from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, has_camera, placeable, placed, virtual_option
+from openant_tools.cli.virtual_for_command import virtual_option
 from openant_tools.numbers import exact, number, span
+from openant_tools.virtual.process import VIRTUAL_DEFAULT, has_camera, placeable, placed
 
 if TYPE_CHECKING:
     from rich.console import Console

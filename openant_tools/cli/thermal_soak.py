@@ -11,8 +11,9 @@ import click
 
 from openant_tools.cli.hardware import Moving, anyway_option, engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import Number, json_option, robot_option
-from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
+from openant_tools.cli.virtual_for_command import virtual_option
 from openant_tools.numbers import exact, number, percent
+from openant_tools.virtual.process import placeable, placed
 
 if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder

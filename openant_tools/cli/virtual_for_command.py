@@ -5,24 +5,9 @@ from __future__ import annotations
 
 import click
 
-from openant_tools.virtual.process import (
-    VIRTUAL_DEFAULT,
-    clock_of_its_own,
-    has_camera,
-    placeable,
-    placed,
-    virtual_robot,
-)
+from openant_tools.virtual.process import VIRTUAL_DEFAULT
 
-__all__ = [
-    "VIRTUAL_DEFAULT",
-    "clock_of_its_own",
-    "has_camera",
-    "placeable",
-    "placed",
-    "virtual_option",
-    "virtual_robot",
-]
+__all__ = ["virtual_option"]
 
 virtual_option = click.option(
     "--virtual",

@@ -22,7 +22,6 @@ import cv2
 import numpy as np
 import pytest
 
-from openant_tools.cli.virtual_for_command import virtual_robot
 from openant_tools.comms import engine_process, messages
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.engine_process import EngineProcess
@@ -38,6 +37,7 @@ from openant_tools.recording.run import Facts
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.kit import home_angles
+from openant_tools.virtual.process import virtual_robot
 
 HOME = np.array(home_angles())
 #: Patience of a test on a loaded machine; the engine itself promises 0.5 s (benchmarks/fault_campaign.py measures it).

@@ -16,7 +16,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openant_tools.cli import main
-from openant_tools.cli.virtual_for_command import virtual_robot
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.messages import ImuConfig
 from openant_tools.comms.setup import config_of_unknown_robot
@@ -30,6 +29,7 @@ from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2, KNEE_TO_GROUND_M
 from openant_tools.sysid.bench.scale import Pressing, stiffness
 from openant_tools.sysid.bench.stiffness import DutyReading, Lever, fit_line, servo_line
 from openant_tools.sysid.bench.tilt import floor_friction
+from openant_tools.virtual.process import virtual_robot
 
 
 def openant(*words: object) -> int:

@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 
 from openant_tools.cli.comms import comms
 from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL, record
-from openant_tools.cli.virtual_for_command import clock_of_its_own, placeable, placed
 from openant_tools.errors import BadInput
 from openant_tools.recording.reader import read_recording
 from openant_tools.robot.folder import create_robot
@@ -30,6 +29,7 @@ from openant_tools.sysid.plan_file import read_plan, write_plan
 from openant_tools.sysid.protocols import FULL, PROTOCOLS, CommandSpace, Protocol, protocol, protocols
 from openant_tools.sysid.record import takes
 from openant_tools.sysid.tracking import tracking
+from openant_tools.virtual.process import clock_of_its_own, placeable, placed
 
 RATE = 100.0
 SPACE = CommandSpace.around_home()

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openant_tools.cli.virtual import virtual
-from openant_tools.cli.virtual_for_command import virtual_robot
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.virtual.process import virtual_robot
 from openant_tools.virtual.scenario import load_scenario
 from openant_tools.virtual.seal import KEY_VARIABLE, commitment_of, open_sealed, read_key
 
