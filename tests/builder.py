@@ -33,6 +33,8 @@ from openant_tools.virtual.start import assemble
 
 #: of a scenario: pictures small enough that a test need not wait for them
 SMALL_PICTURES = "[camera]\nwidth = 640\nheight = 480\nfps = 15\n"
+#: s, of mechanics that a procedure watches, none of whose figures hang on them: twice as coarse as elsewhere
+COARSE_STEP_S = 0.002
 #: of a scenario: servos that rub enough for a calibration to be worth it, whatever noise there is
 RUBS = "[motor]\ncoulomb_nm = 0.09\n"
 
@@ -150,9 +152,11 @@ class Robot:
 def robot(folder: Path, *, sees: bool = False, kit: str = "standard", **table: Any) -> Iterator[Robot]:
     """A virtual robot of a scenario's tables, in stepped time, served by a thread of this process.
 
-    Its mechanics are left out while it stands still, unless the tables say otherwise.
+    Its mechanics are left out while it stands still, and go by coarse steps, unless the tables say otherwise.
     """
-    server = assemble(parse_scenario({"clock": {"doze": True}, **table}), clock="stepped", camera=sees)
+    coarse = {} if "effect" in table else {"step_s": COARSE_STEP_S}
+    scenario = {"clock": {"doze": True}, **table, "robot": {**coarse, **table.get("robot", {})}}
+    server = assemble(parse_scenario(scenario), clock="stepped", camera=sees)
     stop = threading.Event()
     thread = threading.Thread(target=server.run, args=(stop.is_set,))
     thread.start()
