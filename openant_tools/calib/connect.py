@@ -115,13 +115,9 @@ def _picture_of(bench: Bench, config: RobotConfig, source: str | int) -> str:
     Raises:
         OpenAntError: none comes, or OpenCV is not installed.
     """
-    from openant_tools.comms.camera import Camera, CameraSettings  # not without OpenCV
+    from openant_tools.comms.camera import CameraSettings, look  # not without OpenCV
 
-    camera = Camera(CameraSettings(source, exposure=config.camera.exposure, focus=config.camera.focus), clock_of(bench))
-    try:
-        info = camera.open()
-    finally:
-        camera.close()
+    info = look(CameraSettings(source, exposure=config.camera.exposure, focus=config.camera.focus), clock_of(bench))
     return f"{info.width} × {info.height} pixels"
 
 

@@ -140,7 +140,7 @@ def record(
         for place in dict.fromkeys((take.protocol.setup, take.protocol.heading_rad) for take in wanted)
     ]
     if any(_looks(place[0].protocol, camera, record_pictures) for place in placements):
-        _must_know_its_tag(folder, virtual_source, everywhere=bool(camera) or record_pictures)
+        _must_see(folder, virtual_source, everywhere=bool(camera) or record_pictures)
     # A virtual robot that is started here is put where it is needed; any other, and a real one, needs hands.
     moves_itself = virtual_source is not None and placeable(virtual_source)
     for k, place in enumerate(placements):
@@ -172,28 +172,33 @@ def _looks(protocol: Protocol, camera: bool | None, pictures: bool) -> bool:
     return pictures or (protocol.setup == "floor" if camera is None else camera)
 
 
-def _must_know_its_tag(folder: RobotFolder | None, virtual_source: str | None, *, everywhere: bool) -> None:
+def _must_see(folder: RobotFolder | None, virtual_source: str | None, *, everywhere: bool) -> None:
     """Before anything moves: what is played last may be the first to look through the camera.
 
     Args:
         everywhere: whether the camera is read on the stand, too.
 
     Raises:
-        BadInput: robot.toml does not say what the camera is to look for.
+        BadInput: robot.toml does not say what the camera is to look for. HardwareFault: a real robot's camera shows nothing.
     """
+    from openant_tools.comms.clock import RealClock
     from openant_tools.comms.setup import camera_of_robot
-    from openant_tools.errors import BadInput
+    from openant_tools.errors import OpenAntError
 
     if folder is None:
         return
     source = VIRTUAL_DEFAULT if virtual_source is not None and has_camera(virtual_source) else None
     try:
-        camera_of_robot(folder.config(), source)
-    except BadInput as error:
+        camera = camera_of_robot(folder.config(), source)
+        if camera is not None and virtual_source is None:
+            from openant_tools.comms.camera import look  # not without OpenCV
+
+            look(camera.settings, RealClock())
+    except OpenAntError as error:
         ways = "record without the camera (--no-camera)" + (
             "" if everywhere else ", or on the stand alone (--setup stand)"
         )
-        raise BadInput(error.what, where=error.where, remedy=f"{error.remedy}; or {ways}") from None
+        raise type(error)(error.what, where=error.where, remedy=f"{error.remedy}; or {ways}") from None
 
 
 def protocols_of(

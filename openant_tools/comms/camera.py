@@ -323,6 +323,15 @@ class Camera:
         return self._source
 
 
+def look(settings: CameraSettings, clock: Clock) -> CameraInfo:
+    """What a camera's first picture is like; it is closed again. Raises as `Camera.open`."""
+    camera = Camera(settings, clock)
+    try:
+        return camera.open()
+    finally:
+        camera.close()
+
+
 class _Frozen:
     """Notices pictures that do not change."""
 

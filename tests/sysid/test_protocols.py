@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from openant_tools.cli.comms import comms
 from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL, record
-from openant_tools.errors import BadInput
+from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.recording.reader import read_recording
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES
@@ -281,6 +281,17 @@ def test_a_camera_that_looks_for_no_tag_yet_is_told_before_the_robot_moves(tmp_p
         out = ["--virtual", *source, "--out", str(tmp_path / f"{name}.mcap")]
         result = CliRunner().invoke(record, [*out, *quick, *more])
         assert result.exit_code == 0, result.output
+
+
+def test_a_camera_that_shows_nothing_is_told_before_the_robot_moves(tmp_path: Path) -> None:
+    """A real robot's: its port is not even opened."""
+    camera = str(tmp_path / "video9")
+    folder = create_robot(tmp_path / "ant", values={"camera.body_tag_id": 12, "ports.camera": camera}).path
+    arguments = ["--port", "/dev/ttyUSB9", "--robot", str(folder), "--out", str(tmp_path / "run.mcap"), "--yes"]
+    result = CliRunner().invoke(record, arguments)
+    assert isinstance(result.exception, HardwareFault)
+    assert camera in str(result.exception)
+    assert "--no-camera" in str(result.exception)
 
 
 def test_a_plan_is_played_with_legs_released_and_caught_then_on_the_floor(tmp_path: Path) -> None:
