@@ -80,7 +80,8 @@ def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(identification, "RECORD_S", 5.0)
     monkeypatch.setattr(arena, "WIGGLE_S", 3.0)
     monkeypatch.setattr(comms_step, "DEFAULT_MIN", 0.1)
-    monkeypatch.setattr(thermal_step, "DEFAULT_MIN", 1.0)
+    monkeypatch.setattr(thermal_step, "DEFAULT_MIN", 0.3)
+    monkeypatch.setattr(thermal_step, "SHORTEST_MIN", 0.3)
 
 
 @pytest.fixture(scope="module")
