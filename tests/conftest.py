@@ -59,24 +59,41 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture
 def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody waits for hands here: readings while a virtual hand moves something end with its motion, motions are short."""
+    """Nobody waits for hands here: readings while a virtual hand moves something end with its motion, motions are short.
+
+    What is counted over and over again to find what is rare, and is not there, is counted less often.
+    """
     from openant_tools.bringup import comms_step, identification
-    from openant_tools.calib import arena, legs, motions
+    from openant_tools.calib import arena, comms_health, inventory, legs, motions, sweep
+    from openant_tools.comms import bench, soak
     from openant_tools.thermal import step as thermal_step
 
+    monkeypatch.setattr(comms_health, "CYCLES", 100)
+    monkeypatch.setattr(comms_health, "FAST_S", 0.3)
+    monkeypatch.setattr(bench, "TRIES", 10)
+    monkeypatch.setattr(inventory, "SWEEP_READS", 30)
+    monkeypatch.setattr(soak, "MOVE_S", 4.0)
+    monkeypatch.setattr(soak, "REST_S", 1.0)
+    monkeypatch.setattr(sweep, "SPEED_RAD_S", 0.7)
     monkeypatch.setattr(legs, "READ_S", 2.5)
     monkeypatch.setattr(motions, "SECONDS", dict.fromkeys(motions.LIBRARY, 1.5))
     monkeypatch.setattr(identification, "RECORD_S", 5.0)
     monkeypatch.setattr(arena, "WIGGLE_S", 3.0)
-    monkeypatch.setattr(comms_step, "DEFAULT_MIN", 0.2)
-    monkeypatch.setattr(thermal_step, "DEFAULT_MIN", 1.0)
+    monkeypatch.setattr(comms_step, "DEFAULT_MIN", 0.1)
+    monkeypatch.setattr(thermal_step, "DEFAULT_MIN", 0.3)
+    monkeypatch.setattr(thermal_step, "SHORTEST_MIN", 0.3)
 
 
 @pytest.fixture(scope="module")
 def half_rate() -> Iterator[None]:
-    """The engine of calibration goes round 50 times a second: half of the packets, and every motion as long."""
+    """The engine of calibration goes round 50 times a second: half of the packets, and every motion as long.
+
+    The mechanics of robots in this process, which have neither play nor springs, take steps of twice the length, too.
+    """
     from openant_tools.calib import wires
+    from openant_tools.virtual import scenario
 
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scenario, "STEP_S", 2e-3)
         patch.setattr(wires, "config_of_robot", functools.partial(wires.config_of_robot, rate_hz=50.0))
         yield

@@ -22,6 +22,8 @@ __all__ = ["comms_health"]
 COMMAND = "openant calib comms"
 #: Cycles at the control rate, as long as a builder is willing to wait.
 CYCLES, RATE_HZ = 500, 100.0
+#: s of writing and reading as fast as it goes
+FAST_S = 2.0
 LOST_SHARE = 0.002
 #: Of what the wire would allow; less is an adapter that holds answers back.
 RATE_SHARE = 0.35
@@ -56,7 +58,7 @@ def comms_health(bench: Bench) -> Procedure:
         lost = dict(zip(servos.joints, rows.sum(axis=0).tolist(), strict=True))
         host = bus.clock.lateness.words or "answers came late"
         yield Progress(0.5, "as fast as it goes")
-        rate = measure_rate(bus, servos.ids, 2.0)
+        rate = measure_rate(bus, servos.ids, FAST_S)
         yield Progress(0.8, "the pause that is needed between writing and reading")
         trials, gap = measure_gap(bus, servos.ids)
         busy = bus.clock.lateness.busy

@@ -13,10 +13,13 @@ __all__ = ["minutes", "noted"]
 
 T = TypeVar("T")
 
+#: s of a part
+PART_S = 60
+
 
 def minutes(seconds: float) -> tuple[str, ...]:
     """`minute 1`, `minute 2`, …: parts of so many s, equally long."""
-    return tuple(f"minute {k + 1}" for k in range(max(1, math.ceil(seconds / 60))))
+    return tuple(f"minute {k + 1}" for k in range(max(1, math.ceil(seconds / PART_S))))
 
 
 def noted(work: Subroutine[T], parts: Parts, **facts: Any) -> Subroutine[T]:

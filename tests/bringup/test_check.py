@@ -19,6 +19,8 @@ from openant_tools.procedure.step import Event, Progress
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 
+pytestmark = pytest.mark.usefixtures("half_rate")
+
 HEALTHY = {
     joint: JointSweep(
         joint, 0.04, 0.002, 0.025 if joint.startswith("knee") else 0.0, 0.004, -0.787 if "hip" in joint else -1.223,

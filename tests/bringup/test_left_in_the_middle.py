@@ -18,6 +18,7 @@ from openant_tools.bringup.walk import WALK, do, standing
 from openant_tools.cli.face import CommandFace
 from openant_tools.comms.soak import soaked_seconds
 from openant_tools.errors import HardwareFault
+from openant_tools.procedure import by_time
 from openant_tools.procedure.finding import Finding, keep
 from openant_tools.procedure.step import Answer, Ask, Bench, Declined, Event, Intent, Live, Procedure, Progress, Step
 from openant_tools.procedure.unfinished import Unfinished, unfinished
@@ -66,11 +67,15 @@ def test_every_step_with_parts_notes_them(step: Step) -> None:
     assert f'Parts(bench, "{step.name}"' in module.read_text()
 
 
-def test_a_watch_over_the_bus_goes_on_with_its_next_minute(tmp_path: Path) -> None:
+def test_a_watch_over_the_bus_goes_on_with_its_next_minute(
+    tmp_path: Path, brisk: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In minutes of 20 s."""
+    monkeypatch.setattr(by_time, "PART_S", 20)
     with robot(tmp_path / "ant") as there:
         note = left(
             there, comms_step, "comms", lambda event: isinstance(event, Progress) and (event.share or 0) > 0.68 and "lost" in event.words,
-            **{"how long": 1.5},
+            **{"how long": 0.5},
         )  # fmt: skip
         assert (note.words, note.next) == ("1 of 2", "minute 2")
         (soak,) = there.folder.recordings.iterdir()
@@ -78,10 +83,10 @@ def test_a_watch_over_the_bus_goes_on_with_its_next_minute(tmp_path: Path) -> No
         finding, builder = there.do(comms_step(there.bench))
     assert finding.ok, finding
     assert not asked(builder)
-    assert "swing all legs gently on the stand until it was 1.5 min in all" in builder.said
-    assert 55 < before < 75
+    assert "swing all legs gently on the stand until it was 0.5 min in all" in builder.said
+    assert 18 < before < 25
     assert list(there.folder.recordings.iterdir()) == [soak]
-    assert soaked_seconds(soak) == pytest.approx(90, abs=3)
+    assert soaked_seconds(soak) == pytest.approx(30, abs=1)
     assert unfinished(there.folder, "comms", virtual=True) is None
 
 

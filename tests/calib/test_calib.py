@@ -639,7 +639,7 @@ def test_a_wrong_spline_a_mirrored_leg_and_exchanged_ids_are_all_named(tmp_path)
 
 def test_a_leg_that_is_not_straight_is_named(tmp_path):
     crooked = [{"effect": "zero_offset", "joints": ["knee_rr"], "parameters": {"angle_rad": 0.3}}]
-    with robot(tmp_path / "ant", effect=crooked) as ant:
+    with robot(tmp_path / "ant", effect=crooked, robot={"step_s": 1e-3}) as ant:
         finding, _ = ant.do(zeros(replace(ant.bench, joints=("knee_rr",))))
         assert not finding.ok
         assert "knee_rr: +17.2° beside the grid" in finding.problems[0]

@@ -276,8 +276,9 @@ def test_a_camera_that_looks_for_no_tag_yet_is_told_before_the_robot_moves(tmp_p
     assert not list(tmp_path.glob("*.mcap"))
     blind = tmp_path / "blind.toml"
     blind.write_text("[camera]\npresent = false\n")
-    quick = ["--robot", str(folder), "--seconds", "20", "--yes"]
-    for source, name, more in (([str(blind)], "blind", []), ([], "stand", ["--setup", "stand", "--protocol", "stand"])):
+    quick = ["--robot", str(folder), "--rate", "50", "--yes"]
+    stand = ["--setup", "stand", "--protocol", "stand", "--seconds", "5"]
+    for source, name, more in (([str(blind)], "blind", ["--seconds", "20"]), ([], "stand", stand)):
         out = ["--virtual", *source, "--out", str(tmp_path / f"{name}.mcap")]
         result = CliRunner().invoke(record, [*out, *quick, *more])
         assert result.exit_code == 0, result.output

@@ -32,6 +32,8 @@ from openant_tools.virtual.process import VIRTUAL_DEFAULT, virtual_robot
 pytestmark = pytest.mark.usefixtures("half_rate")
 WIDE = (120, 40)
 BLIND = "[camera]\npresent = false\n"
+#: of a robot in a process of its own: its mechanics take steps twice as long as they do by themselves
+COARSE = "[robot]\nstep_s = 0.002\n"
 
 
 @dataclass
@@ -76,7 +78,7 @@ class Robot:
 def robot(folder: Path, scenario: str) -> Iterator[Robot]:
     """The robot of a scenario; what its servos remember stands in a file."""
     memory, path = folder / "memory.json", folder / "scenario.toml"
-    path.write_text(scenario.replace("[robot]\n", f"[robot]\neeprom = {json.dumps(str(memory))}\n", 1))
+    path.write_text(scenario.replace("[robot]\n", f"{COARSE}eeprom = {json.dumps(str(memory))}\n", 1))
     with virtual_robot(str(path), clock="stepped") as found:
         one = Robot(create_robot(folder / "my-ant"), found, memory)
         yield one
@@ -243,7 +245,7 @@ def test_the_whole_walk_from_loose_motors_to_the_passport_and_on_to_learning(
     """By the command from the box to the built legs, where Ctrl-C ends it; from there by the screens; then it learns."""
     folder, given, report = tmp_path / "ant", tmp_path / "box.toml", tmp_path / "walk.json"
     left = '[[servo]]\njoint = "hip_fl"\nbaud = 4500000\n'  # somebody has played with one motor
-    given.write_text(f'[robot]\nsetup = "loose"\n[clock]\ndoze = true\n{SMALL_PICTURES}{RUBS}{left}')
+    given.write_text(f'{COARSE}setup = "loose"\n[clock]\ndoze = true\n{SMALL_PICTURES}{RUBS}{left}')
 
     def bringup(source: str) -> tuple[object, str]:
         with pytest.raises(SystemExit) as end:  # in this process, where motions can be short
@@ -266,6 +268,9 @@ def test_the_whole_walk_from_loose_motors_to_the_passport_and_on_to_learning(
     states = {name: now.state for name, now in standing(RobotFolder.at(folder)).items()}
     assert states == dict.fromkeys(built, "ok") | dict.fromkeys(rest, "todo"), words[-4000:]
 
+    # What is fitted takes the robot's own steps.
+    nominal = folder / "nominal.xml"
+    nominal.write_text(nominal.read_text().replace('timestep="0.001"', 'timestep="0.002"', 1))
     said = dict[str, str]()
 
     async def walk(walker: Walker) -> None:
@@ -278,7 +283,7 @@ def test_the_whole_walk_from_loose_motors_to_the_passport_and_on_to_learning(
         box.builder.resume(assembled=True)
         addresses = {"bus": box.bus, "imu": box.imu, "camera": box.camera, "control": box.control}
         ant = Robot(RobotFolder.at(folder), addresses, folder / "virtual-eeprom.json")
-        ant.walk(walk, {"while the legs swing. For how long?": "0.2", "Soak for how long?": "1"})
+        ant.walk(walk, {"while the legs swing. For how long?": "0.1", "Soak for how long?": "0.3"})
         ant.remote.close()
     states = {name: now.state for name, now in standing(ant.folder).items()}
     failed = [name for name, state in states.items() if state != "ok"]
@@ -303,7 +308,7 @@ def test_the_whole_walk_from_loose_motors_to_the_passport_and_on_to_learning(
     # demo learns in the simulation of one.)
     command = [sys.executable, "-m", "openant_tools.cli", "train", "sac", "--robot", str(folder)]
     floor = tmp_path / "floor.toml"
-    floor.write_text(f'[robot]\nsetup = "floor"\n[clock]\nmode = "stepped"\n{SMALL_PICTURES}')
+    floor.write_text(f'{COARSE}setup = "floor"\n[clock]\nmode = "stepped"\n{SMALL_PICTURES}')
     how = [
         "--steps",
         "10",
