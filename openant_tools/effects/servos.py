@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from openant_tools.effects.step import Law, Step
 from openant_tools.model.plant import KD, KP, MOTOR_CONSTANT, RESISTANCE, TORQUE_OFF_GROUP, VMAX, Plant, is_motor
 
-__all__ = ["Servos", "batch_of", "single"]
+__all__ = ["Servos", "as_slice", "batch_of", "single"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -66,12 +66,12 @@ class Servos:
         self._on = np.ones((self._n, len(i)), bool)
         self._rest = self._read()
         self._full = np.ones((self._n, len(i)))
-        self._qpos, self._dof, self._ctrl = _taken(plant.qpos), _taken(plant.dof), _taken(plant.ctrl)
+        self._qpos, self._dof, self._ctrl = as_slice(plant.qpos), as_slice(plant.dof), as_slice(plant.ctrl)
         self._filters = bool(self._filtered.any())
         motors, others = np.flatnonzero(self._motor), np.flatnonzero(~self._motor)
         # Of each sort of servo its joints and its actuators; None where there is none.
         self._motors, self._others, self._proportional, self._bounded = (
-            (_taken(joints), _taken(i[joints])) if len(joints) else None
+            (as_slice(joints), as_slice(i[joints])) if len(joints) else None
             for joints in (motors, others, others[self._fixed[others]], others[self._limited[others]])
         )
         # Of the gain on the setpoint to that on the position; from here, so that no rounding piles up from step to step.
@@ -206,7 +206,7 @@ class Servos:
                 force[:, k, 0], force[:, k, 1] = -most, most
 
 
-def _taken(ids: Ints) -> Ints | slice:
+def as_slice(ids: Ints) -> Ints | slice:
     """Ids that follow each other as a slice, which reads and writes several times as fast."""
     first = int(ids[0])
     return slice(first, first + len(ids)) if np.array_equal(ids, first + np.arange(len(ids))) else ids
