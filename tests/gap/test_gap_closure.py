@@ -29,7 +29,7 @@ from openant_tools.gap.simulation import Log, simulate
 from openant_tools.model.plant import load_plant
 from openant_tools.model.rollout import Rollouts
 
-T = 2.0 + np.arange(150) / 50
+T = 2.0 + np.arange(100) / 50
 
 
 def beyond_one_build(one: Closure, plain: Closure) -> float:
@@ -142,10 +142,10 @@ def test_a_cause_is_found_from_a_size_that_does_nothing(limit: float, tmp_path: 
         pendulum(f'<position {SERVO} kp="8" forcerange="-0.6 0.6"/>').replace(BENCH, "")
     )
     robot.opt.timestep = 0.0005
-    runs = []
+    t, runs = 2.0 + np.arange(150) / 50, []
     for amplitude in (0.4, 0.7):
-        columns = drive(robot, ["joint"], T, amplitude * sweep(T, 1), noise=3e-4, quantum=ENCODER_RAD)
-        runs.append(run_of(columns, T, ["joint"], f"sweep-{amplitude}"))
+        columns = drive(robot, ["joint"], t, amplitude * sweep(t, 1), noise=3e-4, quantum=ENCODER_RAD)
+        runs.append(run_of(columns, t, ["joint"], f"sweep-{amplitude}"))
     model = write(tmp_path / "given.xml", pendulum(f'<position {SERVO} kp="8" forcerange="-4 4"/>'))
     fits = Fits(Predictions(RunSet.of(runs, model, ["joint"], [None, None])))
     start = fits.of([Part("torque_limit", (0,))], [{"limit": limit}])
