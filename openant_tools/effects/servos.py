@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -212,16 +213,20 @@ def as_slice(ids: Ints) -> Ints | slice:
     return slice(first, first + len(ids)) if np.array_equal(ids, first + np.arange(len(ids))) else ids
 
 
+@functools.cache
+def _fields() -> tuple[str, ...]:
+    """Arrays of a model that may differ from simulation to simulation of a batch; others are options."""
+    return tuple(name for name in sorted(MODEL_FIELDS) if hasattr(mujoco.MjModel, name))
+
+
 def batch_of(plant: Plant, models: Sequence[mujoco.MjModel], copies: int, nthread: int = 0) -> tuple[Batch, Servos]:
     """`copies` simulations of each of `models` (variants of the plant's), the variants of each copy side by side."""
     base = copy.copy(models[0])
     base.opt.disableactuator |= 1 << TORQUE_OFF_GROUP
     batch = Batch(base, copies * len(models), nthread)
-    for name in sorted(MODEL_FIELDS):
-        if not hasattr(base, name):
-            continue  # options
+    for name in _fields() if len(models) > 1 else ():
         values = np.array([getattr(model, name) for model in models])
-        if len(models) > 1 and (values != values[0]).any():
+        if (values != values[0]).any():
             field = batch.expand(name)
             field[:] = np.tile(values.reshape(len(models), *field.shape[1:]), (copies, *[1] * (field.ndim - 1)))
     states = {name: batch.bind(name) for name in ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "qfrc_bias")}

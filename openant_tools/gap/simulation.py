@@ -154,7 +154,8 @@ class _Batch:
         self._plant, self._segments = rollouts.plant, rollouts.segments
         self._n = len(robots)
         plant, copies = self._plant, len(self._segments)
-        models = [rollouts.lean(robot.model(plant)) for robot in robots]
+        scratch = mujoco.MjData(plant.model)
+        models = [rollouts.lean(robot.model(plant, scratch)) for robot in robots]
         # A batch takes arrays from its models, flags from the first.
         models[0].flg_adhesion = any(robot.adhesion_n > 0 for robot in robots)
         self._batch, self._servos = batch_of(plant, models, copies, rollouts.nthread)
