@@ -155,15 +155,17 @@ def test_a_cause_is_found_from_a_size_that_does_nothing(limit: float, tmp_path: 
     assert found.refit.x[0]["limit"] == pytest.approx(math.log(0.6 / 4), abs=0.4)
 
 
-@pytest.mark.parametrize("name", ["actuator_lag", "action_delay", "load_friction", "backlash"])
-def test_a_cause_that_is_not_there_ends_at_nothing_and_not_beyond(name: str, tmp_path: Path) -> None:
+def test_causes_that_are_not_there_end_at_nothing_and_not_beyond(tmp_path: Path) -> None:
     fits = Fits(Predictions(protocol(tmp_path, kp=8.0, dry=0.03)))
-    start = catalogue()[name].starts(0.2)[0]
-    plain, found = closures(fits, [fits.nothing(), fits.of([Part(name, (0,))], [start])], [(0,), (1,)], [0, 1])
-    size = catalogue()[name].quantities[0].name
-    assert 0 <= found.refit.x[0][size] < start[size]
-    assert found.support(plain) < 0.2, "held-out data do not speak for it"
-    assert np.isfinite([found.before, found.floor, found.after, found.low, found.high, found.foretold]).all()
+    names = ("actuator_lag", "action_delay", "load_friction", "backlash")
+    starts = [catalogue()[name].starts(0.2)[0] for name in names]
+    asked = [fits.of([Part(name, (0,))], [start]) for name, start in zip(names, starts, strict=True)]
+    plain, *every = closures(fits, [fits.nothing(), *asked], [(0,), (1,)], [0, 1])
+    for name, start, found in zip(names, starts, every, strict=True):
+        size = catalogue()[name].quantities[0].name
+        assert 0 <= found.refit.x[0][size] < start[size], name
+        assert found.support(plain) < 0.2, f"held-out data do not speak for {name}"
+        assert np.isfinite([found.before, found.floor, found.after, found.low, found.high, found.foretold]).all(), name
 
 
 def test_none_begins_anew_where_a_little_of_a_cause_has_led_out_of_a_hollow(
