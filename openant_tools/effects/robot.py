@@ -264,8 +264,12 @@ class Robot:
         """An effect's parameter, to be changed in place."""
         return self.laws.setdefault((effect, parameter), np.zeros(self.joints))
 
-    def model(self, plant: Plant) -> mujoco.MjModel:
-        """A variant of the plant's model with all of this that a compiled model can carry."""
+    def model(self, plant: Plant, scratch: mujoco.MjData | None = None) -> mujoco.MjModel:
+        """A variant of the plant's model with all of this that a compiled model can carry.
+
+        Args:
+            scratch: of the plant's model, to compute with, where many variants are made: it takes longer to make than to use.
+        """
         model = copy.copy(plant.model)
         for kind, factors in self.scale.items():
             if kind == "link_mass":
@@ -288,7 +292,7 @@ class Robot:
         if not self.creeps:
             hold_still(model, plant)
         self._body(model, plant)
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        mujoco.mj_setConst(model, scratch or mujoco.MjData(model))
         return model
 
     def _body(self, model: mujoco.MjModel, plant: Plant) -> None:

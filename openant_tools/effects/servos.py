@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from openant_tools.effects.step import Law, Step
 from openant_tools.model.plant import KD, KP, MOTOR_CONSTANT, RESISTANCE, TORQUE_OFF_GROUP, VMAX, Plant, is_motor
 
-__all__ = ["Servos", "batch_of", "single"]
+__all__ = ["Servos", "as_slice", "batch_of", "single"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -66,12 +67,12 @@ class Servos:
         self._on = np.ones((self._n, len(i)), bool)
         self._rest = self._read()
         self._full = np.ones((self._n, len(i)))
-        self._qpos, self._dof, self._ctrl = _taken(plant.qpos), _taken(plant.dof), _taken(plant.ctrl)
+        self._qpos, self._dof, self._ctrl = as_slice(plant.qpos), as_slice(plant.dof), as_slice(plant.ctrl)
         self._filters = bool(self._filtered.any())
         motors, others = np.flatnonzero(self._motor), np.flatnonzero(~self._motor)
         # Of each sort of servo its joints and its actuators; None where there is none.
         self._motors, self._others, self._proportional, self._bounded = (
-            (_taken(joints), _taken(i[joints])) if len(joints) else None
+            (as_slice(joints), as_slice(i[joints])) if len(joints) else None
             for joints in (motors, others, others[self._fixed[others]], others[self._limited[others]])
         )
         # Of the gain on the setpoint to that on the position; from here, so that no rounding piles up from step to step.
@@ -206,10 +207,16 @@ class Servos:
                 force[:, k, 0], force[:, k, 1] = -most, most
 
 
-def _taken(ids: Ints) -> Ints | slice:
+def as_slice(ids: Ints) -> Ints | slice:
     """Ids that follow each other as a slice, which reads and writes several times as fast."""
     first = int(ids[0])
     return slice(first, first + len(ids)) if np.array_equal(ids, first + np.arange(len(ids))) else ids
+
+
+@functools.cache
+def _fields() -> tuple[str, ...]:
+    """Arrays of a model that may differ from simulation to simulation of a batch; others are options."""
+    return tuple(name for name in sorted(MODEL_FIELDS) if hasattr(mujoco.MjModel, name))
 
 
 def batch_of(plant: Plant, models: Sequence[mujoco.MjModel], copies: int, nthread: int = 0) -> tuple[Batch, Servos]:
@@ -217,11 +224,9 @@ def batch_of(plant: Plant, models: Sequence[mujoco.MjModel], copies: int, nthrea
     base = copy.copy(models[0])
     base.opt.disableactuator |= 1 << TORQUE_OFF_GROUP
     batch = Batch(base, copies * len(models), nthread)
-    for name in sorted(MODEL_FIELDS):
-        if not hasattr(base, name):
-            continue  # options
+    for name in _fields() if len(models) > 1 else ():
         values = np.array([getattr(model, name) for model in models])
-        if len(models) > 1 and (values != values[0]).any():
+        if (values != values[0]).any():
             field = batch.expand(name)
             field[:] = np.tile(values.reshape(len(models), *field.shape[1:]), (copies, *[1] * (field.ndim - 1)))
     states = {name: batch.bind(name) for name in ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "qfrc_bias")}

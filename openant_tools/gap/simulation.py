@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from openant_tools.effects.robot import Cable, Form, Robot, tilted
 from openant_tools.effects.rollout import laws_of
-from openant_tools.effects.servos import batch_of
+from openant_tools.effects.servos import as_slice, batch_of
 from openant_tools.effects.step import Law, Step
 from openant_tools.gap.initial_state import heats, setpoints
 from openant_tools.gap.laws import Fields, Transmission, back_emf, first_laws, last_laws
@@ -154,7 +154,8 @@ class _Batch:
         self._plant, self._segments = rollouts.plant, rollouts.segments
         self._n = len(robots)
         plant, copies = self._plant, len(self._segments)
-        models = [rollouts.lean(robot.model(plant)) for robot in robots]
+        scratch = mujoco.MjData(plant.model)
+        models = [rollouts.lean(robot.model(plant, scratch)) for robot in robots]
         # A batch takes arrays from its models, flags from the first.
         models[0].flg_adhesion = any(robot.adhesion_n > 0 for robot in robots)
         self._batch, self._servos = batch_of(plant, models, copies, rollouts.nthread)
@@ -303,7 +304,9 @@ class _Batch:
         lengths = np.array([len(segment.control) for segment in segments])
         longest, sims = int(lengths[0]), n * len(segments)
         control = self._controls(self._led + longest)
-        ctrl, time = self._batch.bind("ctrl"), np.zeros(sims)
+        ctrl, time, h, of_joints = self._batch.bind("ctrl"), np.zeros(sims), plant.timestep, as_slice(plant.ctrl)
+        # Of each step how many simulations take it: those of the longer segments come first.
+        going = (n * (lengths[:, None] > np.arange(longest)).sum(axis=0)).tolist()
         rest = np.repeat([segment.control[0] for segment in segments], n, axis=0)
         ctrl[:] = rest
         switches = self._switches()
@@ -312,8 +315,7 @@ class _Batch:
         cable = self._cable()
         self._lead(control)
         before = self._servos.state
-        for step in range(longest):
-            active = int((lengths > step).sum()) * n
+        for step, active in enumerate(going):
             self._share = None
             for some, off, share in switches.get(step, ()):
                 self._servos.switch(some, off)
@@ -322,13 +324,13 @@ class _Batch:
                         np.ones((n * len(segments), len(plant.joints))) if self._share is None else self._share
                     )
                     self._share[some] = share
-            ctrl[:, plant.ctrl] = control[:, self._led + step]
+            ctrl[:, of_joints] = control[:, self._led + step]
             self._servos.prepare(self._laws, time, before)
             states.keep(step, before, self._given if self._told else None)
             if cable is not None:
                 cable()
             self._batch.step(ids=None if active == sims else np.arange(active, dtype=np.int32))
-            time += plant.timestep
+            time += h
             before = self._servos.state
         states.keep(longest, before, None)
         self._sample(states, out)

@@ -316,7 +316,8 @@ def forecast(
             )
         )
     every = max(1, steps // 400)
-    fan = {q: np.quantile(paths[:, ::every], q, axis=0) - 0.5 for q in (0.025, 0.25, 0.5, 0.75, 0.975)}
+    shown = (0.025, 0.25, 0.5, 0.75, 0.975)
+    fan = dict(zip(shown, np.quantile(paths[:, ::every], shown, axis=0) - 0.5, strict=True))
     return HeatForecast(tuple(joints), load, t[::every], fan)
 
 

@@ -148,8 +148,23 @@ def test_one_wish_to_stop_ends_waiting_for_a_robot(tmp_path, learn):
     assert load_checkpoint(tmp_path)["transitions"] == 30
 
 
+class NoLearner:
+    """Stands for the learner where there is nothing to learn: a process that loads torch takes three seconds to begin."""
+
+    updates = 0
+
+    def __init__(self, job, agent) -> None: ...
+    def follow(self) -> None: ...
+    def tell(self, state) -> None: ...
+    def end(self, state) -> None: ...
+    def close(self) -> None: ...
+
+
 @pytest.mark.parametrize("learn", [train, train_async])
-def test_a_circle_stays_where_the_robot_stood_first_when_its_run_goes_on(tmp_path, learn):
+def test_a_circle_stays_where_the_robot_stood_first_when_its_run_goes_on(tmp_path, monkeypatch, learn):
+    # The acting process alone has to do with circles.
+    monkeypatch.setattr(async_training, "LearnerProcess", NoLearner)
+
     class Placed(Robot):
         """One whose circle nobody chose."""
 

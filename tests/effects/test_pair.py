@@ -50,7 +50,11 @@ def command(*words: object) -> int:
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    text = pendulum().replace('name="joint"', 'name="knee_fl"').replace('joint="joint"', 'joint="knee_fl"')
+    text = (
+        pendulum(option='timestep="0.002" integrator="implicitfast"')
+        .replace('name="joint"', 'name="knee_fl"')
+        .replace('joint="joint"', 'joint="knee_fl"')
+    )
     return write(tmp_path_factory.mktemp("given") / "pendulum.xml", text)
 
 

@@ -36,15 +36,19 @@ ATTACKS: dict[str, Callable[[Path, Path], object]] = {
 
 
 @pytest.mark.slow
-def test_what_was_altered_is_made_anew_and_runs_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_altered_is_made_anew_and_runs_no_code(
+    tmp_path: Path, few_causes: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
     monkeypatch.setattr("openant_tools.gap.assess.MEASURE", 12)
     monkeypatch.setattr("openant_tools.gap.assess.OTHERS", 4)
     monkeypatch.setattr("openant_tools.gap.assess.PARTS", 1)  # few templates take no longer than one
-    t = np.arange(0.0, 6.0, 0.02)
-    command = sweep(t, 1)
-    columns = {"cmd.joint": command[:, 0], "pos.joint": 0.9 * command[:, 0]}
-    made = Experiment.of([run_of(columns, t, ["joint"])], write(tmp_path / "given.xml", pendulum()), ["joint"])
+    t, runs = np.arange(0.0, 1.2, 0.02), []
+    for size in (0.6, 0.9):
+        command = sweep(t, 1, size)
+        columns = {"cmd.joint": command[:, 0], "pos.joint": 0.9 * command[:, 0]}
+        runs.append(run_of(columns, t, ["joint"], f"sweep-{size}"))
+    made = Experiment.of(runs, write(tmp_path / "given.xml", pendulum()), ["joint"])
 
     def said() -> Assessment:
         return assess(made.protocol, jobs=1)

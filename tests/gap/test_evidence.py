@@ -73,7 +73,7 @@ def simulated(pendulum: RunSet) -> tuple[list[Case], NDArray[np.float32], NDArra
     return (
         bank,
         _features(templates_at(pendulum, bank)),
-        _features(robots_at(pendulum, _healthy(pendulum, 40), 1)),
+        _features(robots_at(pendulum, _healthy(pendulum, 60), 1)),
     )
 
 
@@ -128,10 +128,10 @@ def _features(parts: list[NDArray[np.float32]]) -> NDArray[np.float32]:
 
 
 @pytest.mark.slow
-def test_each_cause_is_among_the_first_by_what_it_would_do_to_this_very_recording(pendulum: RunSet) -> None:
-    bank, layouts = templates_of(pendulum), layouts_of(pendulum)
-    templates = _features(templates_at(pendulum, bank))
-    healthy = _features(robots_at(pendulum, _healthy(pendulum, 60), 1))
+def test_each_cause_is_among_the_first_by_what_it_would_do_to_this_very_recording(
+    pendulum: RunSet, simulated: tuple[list[Case], NDArray[np.float32], NDArray[np.float32]]
+) -> None:
+    (bank, templates, healthy), layouts = simulated, layouts_of(pendulum)
     known = np.concatenate([one.layout.known(one.seen) for one in pendulum.runs])
     # Nothing was logged of the supply, and no block of it says anything.
     assert not known[layouts.signal == "volt"].any()

@@ -18,7 +18,7 @@ from openant_tools.gap.protocol import RunSet
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.rollout import Measured, Rollouts, Staircase
 
-T = 2.0 + np.arange(300) / 50
+T = 2.0 + np.arange(200) / 50
 
 
 @pytest.fixture(scope="module")

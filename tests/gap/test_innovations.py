@@ -16,7 +16,7 @@ from openant_tools.recording.run import Facts, Run
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.mjcf import nominal_mjcf
 
-ROWS, PERIOD_S = 450, 0.02
+ROWS, PERIOD_S = 300, 0.02
 
 
 @pytest.fixture(scope="module")

@@ -5,13 +5,9 @@ from __future__ import annotations
 import ast
 import functools
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 
-import openant_agents
-import openant_env
-import openant_tools
+from sources import modules
 
-PACKAGES = [Path(str(package.__file__)).parent for package in (openant_tools, openant_env, openant_agents)]
 MODULES = {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "marshal", "shelve", "yaml", "runpy", "code", "imp"}
 CALLS = {"eval", "exec", "compile", "__import__"}
 #: attribute calls by their last names: module.function
@@ -58,13 +54,8 @@ def found(nodes: Iterable[ast.AST]) -> Iterator[tuple[int, str]]:
 def ours() -> dict[str, list[ast.AST]]:
     """What all our modules import and call, by the modules' names."""
     return {
-        path.relative_to(package.parent).as_posix(): [
-            node
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-            if isinstance(node, ast.Import | ast.ImportFrom | ast.Call)
-        ]
-        for package in PACKAGES
-        for path in sorted(package.rglob("*.py"))
+        module.name: [node for node in module.nodes if isinstance(node, ast.Import | ast.ImportFrom | ast.Call)]
+        for module in modules()
     }
 
 

@@ -6,11 +6,11 @@ import ast
 import math
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
-from places import ROOT, TESTS
+from places import TESTS
 from readable import unreadable
+from sources import modules
 
 from openant_tools.comms.hardware import changes
 from openant_tools.numbers import chosen, column, exact, number, percent, span, typed
@@ -82,23 +82,31 @@ def _as_python(node: ast.expr, shown: set[str]) -> bool:
     )
 
 
+def _displays(scope: ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
+    """Names that a function gives to lists and dictionaries alone."""
+    given: dict[str, list[ast.expr]] = {}
+    for node in ast.walk(scope):
+        if isinstance(node, ast.Assign):
+            for target in node.targets:
+                if isinstance(target, ast.Name):
+                    given.setdefault(target.id, []).append(node.value)
+    return {name for name, values in given.items() if all(isinstance(value, DISPLAYS) for value in values)}
+
+
 def _format(spec: ast.expr | None) -> str:
     """A format of an f-string, with 0 for what it takes from elsewhere."""
     parts = spec.values if isinstance(spec, ast.JoinedStr) else []
     return "".join(str(part.value) if isinstance(part, ast.Constant) else "0" for part in parts)
 
 
-def formatted(code: str) -> Iterator[ast.expr]:
+def formatted(tree: ast.Module) -> Iterator[ast.expr]:
     """Where a number, a list or a dictionary becomes text otherwise than by `openant_tools.numbers`."""
-    tree = ast.parse(code)
-    for scope in [tree, *(node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef))]:
-        given: dict[str, list[ast.expr]] = {}
-        for node in ast.walk(scope) if scope is not tree else ():
-            if isinstance(node, ast.Assign):
-                for target in node.targets:
-                    given.setdefault(ast.unparse(target), []).append(node.value)
-        shown = {name for name, values in given.items() if all(isinstance(value, DISPLAYS) for value in values)}
-        for node in ast.walk(scope):
+    everything = list(ast.walk(tree))
+    scopes = [node for node in everything if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    for nodes, shown in [(everything, set[str]()), *((ast.walk(scope), _displays(scope)) for scope in scopes)]:
+        if nodes is not everything and not shown:
+            continue  # nothing but what was seen with the whole module
+        for node in nodes:
             if isinstance(node, ast.FormattedValue):
                 found = not OF_NO_NUMBER.fullmatch(_format(node.format_spec)) or _as_python(node.value, shown)
             elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
@@ -143,7 +151,7 @@ def formatted(code: str) -> Iterator[ast.expr]:
     ],
 )
 def test_a_number_that_is_formatted_by_hand_is_seen(code):
-    assert list(formatted(code))
+    assert list(formatted(ast.parse(code)))
 
 
 @pytest.mark.parametrize(
@@ -151,24 +159,21 @@ def test_a_number_that_is_formatted_by_hand_is_seen(code):
     ['f"{number(x)}"', 'f"{name:>{width}} {words:40.40} {k:03d} {crc:08x} {day:%Y-%m-%d}"', 'f"{len(x)}"', "str(path)"],
 )
 def test_words_ids_and_dates_are_no_numbers(code):
-    assert not list(formatted(code))
+    assert not list(formatted(ast.parse(code)))
 
 
 def test_no_module_formats_a_number_that_people_read():
     """What a computer reads, such as a value in a file or a model, is marked as such; a command says all of its words to people."""
     found = []
-    for package in ("openant_tools", "openant_env", "openant_agents"):
-        for path in sorted((ROOT / package).rglob("*.py")):
-            code = path.read_text(encoding="utf-8")
-            lines, place = code.splitlines(), path.relative_to(ROOT)
-            if place == Path("openant_tools/numbers.py"):
-                continue
-            spoken = place.is_relative_to("openant_tools/cli")
-            found += [
-                f"{place}:{node.lineno}"
-                for node in formatted(code)
-                if spoken or not any(MARK in line for line in lines[node.lineno - 1 : node.end_lineno])
-            ]
+    for module in modules():
+        if module.name == "openant_tools/numbers.py":
+            continue
+        lines, spoken = module.text.splitlines(), module.name.startswith("openant_tools/cli/")
+        found += [
+            f"{module.name}:{node.lineno}"
+            for node in formatted(module.tree)
+            if spoken or not any(MARK in line for line in lines[node.lineno - 1 : node.end_lineno])
+        ]
     assert not found, f"print with openant_tools.numbers: {found}"
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from places import ROOT
 from serial.tools import list_ports
+from sources import modules
 
 from openant_tools import lock
 from openant_tools.comms.ports import Host, explain_open_error
@@ -34,28 +35,25 @@ SIGNALS_IN = {"openant_tools/comms/guardian.py"}
 def test_what_a_system_may_lack_is_named_in_one_file() -> None:
     found: dict[str, set[str]] = {name: set() for name in ONLY_IN}
     signals = set()
-    for room in ("openant_tools", "openant_env", "openant_agents"):
-        for path in (ROOT / room).rglob("*.py"):
-            where = path.relative_to(ROOT).as_posix()
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                names = [one.name for one in node.names] if isinstance(node, ast.Import) else []
-                if isinstance(node, ast.ImportFrom):
-                    names = [str(node.module)]
-                for name in set(names) & set(found):
-                    found[name].add(where)
-                if isinstance(node, ast.Attribute) and node.attr in ("SIGHUP", "SIGTSTP"):
-                    signals.add(where)
+    for module in modules():
+        for node in module.nodes:
+            names = [one.name for one in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom):
+                names = [str(node.module)]
+            for name in set(names) & set(found):
+                found[name].add(module.name)
+            if isinstance(node, ast.Attribute) and node.attr in ("SIGHUP", "SIGTSTP"):
+                signals.add(module.name)
     assert found == ONLY_IN
     assert signals == SIGNALS_IN
 
 
 def test_whether_there_is_a_terminal_is_asked_in_one_place_which_knows_that_a_stream_may_be_closed() -> None:
-    asking = set()
-    for room in ("openant_tools", "openant_env", "openant_agents"):
-        for path in (ROOT / room).rglob("*.py"):
-            nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-            if any(isinstance(node, ast.Attribute) and node.attr == "isatty" for node in nodes):
-                asking.add(path.relative_to(ROOT).as_posix())
+    asking = {
+        module.name
+        for module in modules()
+        if any(isinstance(node, ast.Attribute) and node.attr == "isatty" for node in module.nodes)
+    }
     assert asking == {"openant_tools/cli/streams.py"}, "ask `has_terminal`"
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from places import ROOT
+from sources import modules
 
 from openant_tools.cli import main
 from openant_tools.errors import BadInput
@@ -222,37 +222,35 @@ def reads_of_settings() -> dict[str, set[str]]:
     sections = {one.name: type(one.default).__name__ for one in dataclasses.fields(RobotConfig) if one.name in SECTIONS}
     classes = {name: section for section, name in sections.items()} | {"Motor": "motors", "CameraFacts": "camera"}
     found: dict[str, set[str]] = {section: set() for section in classes.values()}
-    for root in ("openant_tools", "openant_env", "openant_agents"):
-        for path in (ROOT / root).rglob("*.py"):
-            text = path.read_text()
-            nodes = list(ast.walk(ast.parse(text)))
-            stands: dict[str, str] = {"motor": "motors", "m": "motors"}
-            for node in nodes:
-                pairs: list[tuple[ast.expr, ast.expr]] = []
-                if isinstance(node, ast.Assign):
-                    for target in node.targets:
-                        both = isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple)
-                        pairs += zip(target.elts, node.value.elts, strict=True) if both else [(target, node.value)]
-                elif isinstance(node, ast.arg) and node.annotation is not None:
-                    kind = ast.unparse(node.annotation).rpartition(".")[2]
-                    if kind in classes:
-                        stands[node.arg] = classes[kind]
-                for target, value in pairs:
-                    if isinstance(target, ast.Name) and isinstance(value, ast.Attribute) and value.attr in sections:
-                        stands[target.id] = value.attr
-            for kind in [node for node in nodes if isinstance(node, ast.ClassDef) and node.name in classes]:
-                found[classes[kind.name]] |= {n.attr for n in ast.walk(kind) if isinstance(n, ast.Attribute)}
-            for node in nodes:
-                if not isinstance(node, ast.Attribute):
-                    continue
-                of = node.value
-                section = (
-                    of.attr if isinstance(of, ast.Attribute) and of.attr in sections
-                    else stands.get(of.id) if isinstance(of, ast.Name)
-                    else "motors" if "motors" in text and "motors" in ast.unparse(of) else None
-                )  # fmt: skip
-                if section in found:
-                    found[section].add(node.attr)
+    for module in modules():
+        nodes, text = module.nodes, module.text
+        stands: dict[str, str] = {"motor": "motors", "m": "motors"}
+        for node in nodes:
+            pairs: list[tuple[ast.expr, ast.expr]] = []
+            if isinstance(node, ast.Assign):
+                for target in node.targets:
+                    both = isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple)
+                    pairs += zip(target.elts, node.value.elts, strict=True) if both else [(target, node.value)]
+            elif isinstance(node, ast.arg) and node.annotation is not None:
+                kind = ast.unparse(node.annotation).rpartition(".")[2]
+                if kind in classes:
+                    stands[node.arg] = classes[kind]
+            for target, value in pairs:
+                if isinstance(target, ast.Name) and isinstance(value, ast.Attribute) and value.attr in sections:
+                    stands[target.id] = value.attr
+        for kind in [node for node in nodes if isinstance(node, ast.ClassDef) and node.name in classes]:
+            found[classes[kind.name]] |= {n.attr for n in ast.walk(kind) if isinstance(n, ast.Attribute)}
+        for node in nodes:
+            if not isinstance(node, ast.Attribute):
+                continue
+            of = node.value
+            section = (
+                of.attr if isinstance(of, ast.Attribute) and of.attr in sections
+                else stands.get(of.id) if isinstance(of, ast.Name)
+                else "motors" if "motors" in text and "motors" in ast.unparse(of) else None
+            )  # fmt: skip
+            if section in found:
+                found[section].add(node.attr)
     return found
 
 

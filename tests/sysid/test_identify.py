@@ -491,7 +491,7 @@ def test_what_one_run_promises_and_another_breaks_is_not_kept(model: Path) -> No
 def test_what_is_chosen_is_chosen_by_motion_and_by_gain_and_anew_without_each_turn(tmp_path: Path) -> None:
     files = {kp: plants.write(tmp_path / f"p{kp:g}.xml", MODEL.replace('kp="8"', f'kp="{kp:g}"')) for kp in (8.0, 4.0)}
     runs = [
-        Robot(0.9 * kp, coulomb_friction=0.06).record(f"{motion} {kp:g}", 2.0, seed, model=str(path))
+        Robot(0.9 * kp, coulomb_friction=0.06).record(f"{motion} {kp:g}", 1.5, seed, model=str(path))
         for kp, path in files.items() for seed, motion in enumerate(("a", "b"))
     ]  # fmt: skip
     kinds = ["stiffness", "coulomb_friction"]

@@ -614,10 +614,11 @@ def command(*words: object) -> tuple[int, str]:
     return int(done.return_value or 0), done.output
 
 
-def test_fit_forecast_and_compare_from_tables(tmp_path: Path, stress: Run) -> None:
+def test_fit_forecast_and_compare_from_tables(tmp_path: Path, stress: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("openant_tools.thermal.compare.DRAWS", 200)
     bare = stress
     write_table(bare, tmp_path / "bare.parquet")
-    write_table(stalled(seconds=1500, **motor(case_air_k_w=12.0)), tmp_path / "cool.csv")
+    write_table(stalled(seconds=1000, **motor(case_air_k_w=12.0)), tmp_path / "cool.csv")
     assert command("config", "new", "--kit", "lite", "--robot", tmp_path / "ant")[0] == 0
     code, out = command("thermal", "fit", tmp_path / "bare.parquet", "--json", tmp_path / "fit.json", "--robot", tmp_path / "ant",
                         "--report", tmp_path / "report")  # fmt: skip
