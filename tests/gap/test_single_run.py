@@ -12,10 +12,9 @@ import pytest
 from openant_tools.effects.catalogue import enter
 from openant_tools.effects.robot import Robot
 from openant_tools.errors import BadInput
-from openant_tools.gap import cache, ensemble
+from openant_tools.gap import cache
 from openant_tools.gap.cache import CACHE_VARIABLE
 from openant_tools.gap.diagnose import diagnose
-from openant_tools.gap.population import applicable
 from openant_tools.gap.protocol import RunSet
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.rollout import Rollouts
@@ -64,10 +63,7 @@ def _recorded(model: Path, cause: str | None = None, x: dict[str, float] | None 
 
 
 @pytest.mark.slow
-def test_one_run_of_a_robot_that_is_late_names_what_is_late(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # What is late among all causes test_diagnose.py asks; here it is parts of one run that have to tell it from some.
-    some = {"action_delay", "sensor_delay", "actuator_lag", "slew_limit", "stiffness_error", "coulomb_friction"}
-    monkeypatch.setattr(ensemble, "applicable", lambda given: [one for one in applicable(given) if one.name in some])
+def test_one_run_of_a_robot_that_is_late_names_what_is_late(model: Path) -> None:
     found = diagnose([_recorded(model, "action_delay", {"delay_s": 0.05})], model)
     alike = {"action_delay", "sensor_delay", "actuator_lag"}  # a stand by itself can hardly tell these
     assert {found.effects[0].effect, found.verdict, *(name for group in found.ambiguous_with for name in group)} & alike
