@@ -36,7 +36,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 def small(folder: Path) -> Demo:
     """A demo that is over soon: short recordings, hardly any training."""
-    return Demo(folder, steps=150, record_s=8.0, eval_s=2.4, starts=2)
+    return Demo(folder, steps=150, record_s=8.0, eval_s=1.2, starts=2)
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_what_stands_is_not_done_again_and_what_follows_from_a_change_is(done: D
     again = small(done.folder)
     assert all(again.stands(stage) for stage in again.stages())
 
-    longer = Demo(done.folder, steps=200, record_s=8.0, eval_s=2.4, starts=2)
+    longer = Demo(done.folder, steps=200, record_s=8.0, eval_s=1.2, starts=2)
     assert [stage.name for stage in longer.stages() if not longer.stands(stage)] == ["learn"]
 
     now = time.time() + 5

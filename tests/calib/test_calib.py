@@ -941,7 +941,7 @@ SMALL = {"width": 640, "height": 480, "fps": 15.0}
 
 
 @pytest.mark.slow
-def test_the_arena_is_measured_by_the_robot_itself_which_moves_once_however_often_it_was_left(tmp_path):
+def test_the_arena_is_measured_by_the_robot_itself_which_moves_once_however_often_it_was_left(tmp_path, brisk):
     with robot(tmp_path / "ant", sees=True, camera={**SMALL, "body": {"yaw": 0.3}}, imu=ST) as ant:
         for left_at in (leave_at(Intent, "stand up"), leave_at(Ask, "Radius"), leave_at(Hands, "Put it back")):
             with pytest.raises(KeyboardInterrupt):
