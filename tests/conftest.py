@@ -64,7 +64,7 @@ def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
     What is counted over and over again to find what is rare, and is not there, is counted less often.
     """
     from openant_tools.bringup import comms_step, identification
-    from openant_tools.calib import arena, comms_health, inventory, legs, motions, sweep
+    from openant_tools.calib import arena, centre, comms_health, inventory, legs, motions, sweep
     from openant_tools.comms import bench, soak
     from openant_tools.thermal import step as thermal_step
 
@@ -75,6 +75,7 @@ def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(soak, "MOVE_S", 4.0)
     monkeypatch.setattr(soak, "REST_S", 1.0)
     monkeypatch.setattr(sweep, "SPEED_RAD_S", 0.7)
+    monkeypatch.setattr(centre, "SLOW_RAD_S", 0.8)
     monkeypatch.setattr(legs, "READ_S", 2.5)
     monkeypatch.setattr(motions, "SECONDS", dict.fromkeys(motions.LIBRARY, 1.5))
     monkeypatch.setattr(identification, "RECORD_S", 5.0)

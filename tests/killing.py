@@ -57,9 +57,9 @@ BEGIN_S = 120.0
 #: s between two looks at a robot: before the first torque, and where a delay is measured
 SELDOM_S, OFTEN_S = 0.05, 0.005
 
-#: while all stands still, its mechanics leave the processors to those who are watched here
-STAND = "[camera]\npresent = false\n[clock]\ndoze = true\n"
-LOOSE = f'{STAND}[robot]\nsetup = "loose"\n'
+#: its mechanics leave the processors to those who are watched here: steps are long, and there are none while all stands still
+STAND = "[camera]\npresent = false\n[clock]\ndoze = true\n[robot]\nstep_s = 0.002\n"
+LOOSE = f'{STAND}setup = "loose"\n'
 NAMED = LOOSE + "".join(
     f'[[servo]]\njoint = "{joint.name}"\nid = {joint.id}\nbaud = 1000000\nreturn_delay_time = 0\n'
     for joint in JOINTS.values()
@@ -98,7 +98,7 @@ WAYS: Mapping[str, Way] = {
     "calib estop": Way(LOOSE),
     "calib ids": Way(LOOSE, ("--joint", "hip_rr")),
     "calib centre": Way(NAMED, ("--joint", "hip_rr")),
-    "calib legs": Way(LOOSE.replace("loose", "stand"), ("--joint", "hip_rr")),
+    "calib legs": Way(STAND, ("--joint", "hip_rr")),
     "calib comms": Way(STAND),
     "calib thermal": Way(STAND),
     "calib identify": Way(STAND),
@@ -253,9 +253,10 @@ class InLine:
 def _in_line(pid: int) -> float:
     """s that threads of a process were ready to run and did not, all of them together: buses are served by others than the main one."""
     seconds = 0.0
-    for one in Path(f"/proc/{pid}/task").glob("*/schedstat"):
-        with contextlib.suppress(OSError, IndexError):
-            seconds += int(one.read_text().split()[1]) * 1e-9
+    with contextlib.suppress(OSError):  # the process itself may end while its threads are listed
+        for one in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+            with contextlib.suppress(OSError, IndexError):
+                seconds += int(one.read_text().split()[1]) * 1e-9
     return seconds
 
 

@@ -36,14 +36,15 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 def small(folder: Path) -> Demo:
     """A demo that is over soon: short recordings, hardly any training."""
-    return Demo(folder, steps=150, record_s=8.0, eval_s=2.4, starts=2)
+    return Demo(folder, steps=150, record_s=8.0, eval_s=1.2, starts=2)
 
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory) -> Demo:
-    """A demo that has gone the whole way."""
+    """A demo that has gone the whole way, with robot and model in steps of 2 ms."""
     demo = small(tmp_path_factory.mktemp("demo") / "ant")
     demo.prepare()
+    demo.scenario.write_text(demo.scenario.read_text().replace("[robot]\n", "[robot]\nstep_s = 0.002\n", 1))
     for stage in demo.stages():
         assert not demo.stands(stage)
         shares: list[float] = []
@@ -51,6 +52,8 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Demo:
         assert demo.stands(stage), stage.name
         assert shares == sorted(shares)
         assert stage.name == "robot" or 0.9 < shares[-1] <= 1.0, stage.name
+        if stage.name == "robot":
+            demo.nominal.write_text(demo.nominal.read_text().replace('timestep="0.001"', 'timestep="0.002"', 1))
     demo_figures = write_report(demo)
     (demo.folder / "figures.json").write_text(json.dumps(demo_figures))
     return demo
@@ -96,7 +99,7 @@ def test_what_stands_is_not_done_again_and_what_follows_from_a_change_is(done: D
     again = small(done.folder)
     assert all(again.stands(stage) for stage in again.stages())
 
-    longer = Demo(done.folder, steps=200, record_s=8.0, eval_s=2.4, starts=2)
+    longer = Demo(done.folder, steps=200, record_s=8.0, eval_s=1.2, starts=2)
     assert [stage.name for stage in longer.stages() if not longer.stands(stage)] == ["learn"]
 
     now = time.time() + 5

@@ -27,7 +27,7 @@ from openant_tools.recording.run import Facts
 from openant_tools.recording.telemetry import Cycle, RecordedAnswer, ServoChannel
 from openant_tools.recording.writer import RecordingWriter
 from openant_tools.robot.config import Provenance
-from openant_tools.robot.folder import create_robot
+from openant_tools.robot.folder import NOMINAL_MODEL, create_robot
 from openant_tools.sysid.bench.steps import floor_friction
 from openant_tools.thermal.step import thermal_soak
 
@@ -145,6 +145,8 @@ def test_motions_that_were_recorded_are_not_played_again_unless_the_robot_is_ano
     tmp_path: Path, brisk: None
 ) -> None:
     with robot(tmp_path / "ant", motor={"coulomb_nm": 0.09}) as there:
+        nominal = there.folder.path / NOMINAL_MODEL  # what is fitted takes the robot's own steps
+        nominal.write_text(nominal.read_text().replace('timestep="0.001"', 'timestep="0.002"', 1))
         note = left(
             there,
             identification,

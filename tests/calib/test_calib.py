@@ -328,7 +328,7 @@ def test_legs_that_were_left_are_read_again_and_only_a_difference_reopens_one(tm
         assert re.search("rear right leg is not as it was left: hip_rr is at 88°, hands moved it from", said)
 
 
-def test_centring_that_was_left_goes_on_where_it_was_and_reads_again_what_was_done(tmp_path):
+def test_centring_that_was_left_goes_on_where_it_was_and_reads_again_what_was_done(tmp_path, brisk):
     with robot(tmp_path / "ant", **set_up()) as ant:
         with pytest.raises(KeyboardInterrupt):
             ant.do(centre(ant.bench), ant.builder(before=leave_at(Say, "hip_fr holds")))
@@ -941,7 +941,7 @@ SMALL = {"width": 640, "height": 480, "fps": 15.0}
 
 
 @pytest.mark.slow
-def test_the_arena_is_measured_by_the_robot_itself_which_moves_once_however_often_it_was_left(tmp_path):
+def test_the_arena_is_measured_by_the_robot_itself_which_moves_once_however_often_it_was_left(tmp_path, brisk):
     with robot(tmp_path / "ant", sees=True, camera={**SMALL, "body": {"yaw": 0.3}}, imu=ST) as ant:
         for left_at in (leave_at(Intent, "stand up"), leave_at(Ask, "Radius"), leave_at(Hands, "Put it back")):
             with pytest.raises(KeyboardInterrupt):

@@ -99,8 +99,11 @@ BYTES: dict[str, tuple[dict[str, Any], float, float]] = {
 
 
 @pytest.fixture(scope="module")
-def stepped_robot() -> Iterator[Mapping[str, str | None]]:
-    with virtual_robot("default", clock="stepped", camera=False) as found:
+def stepped_robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mapping[str, str | None]]:
+    """A healthy robot, whose mechanics take longer steps than by themselves: it is the bus that is looked at."""
+    scenario = tmp_path_factory.mktemp("healthy") / "healthy.toml"
+    scenario.write_text("[robot]\nstep_s = 0.002\n")
+    with virtual_robot(str(scenario), clock="stepped", camera=False) as found:
         yield found
 
 

@@ -46,7 +46,7 @@ PATIENCE_S = 20.0
 
 def start(folder: Path, clock: str) -> Iterator[dict[str, str]]:
     scenario = folder / "blind.toml"
-    scenario.write_text("[camera]\npresent = false\n[clock]\ndoze = true\n")
+    scenario.write_text("[robot]\nstep_s = 0.002\n[camera]\npresent = false\n[clock]\ndoze = true\n")
     with virtual_robot(str(scenario), clock=clock) as robot:
         yield dict(robot)  # type: ignore[arg-type]
 

@@ -218,7 +218,7 @@ def held(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     folder = tmp_path_factory.mktemp("held")
     scenario = folder / "held.toml"
     scenario.write_text(
-        '[robot]\nsetup = "stand"\npose = "home"\n'
+        '[robot]\nsetup = "stand"\npose = "home"\nstep_s = 0.002\n'
         "[motor]\np_divisor = 256.0\n"
         '[[effect]]\neffect = "floor_tilt"\nparameters = { angle_rad = 0.2 }\n'
         '[[effect]]\neffect = "blocked_joint"\njoints = ["knee_fl"]\nparameters = { angle_rad = -0.87 }\n'

@@ -25,7 +25,7 @@ SIZE = (80, 24)
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mapping[str, str | None]]:
     """A healthy robot on its stand, in stepped time."""
     scenario = tmp_path_factory.mktemp("bench") / "stand.toml"
-    scenario.write_text('[robot]\nsetup = "stand"\npose = "home"\n[camera]\npresent = false\n')
+    scenario.write_text('[robot]\nsetup = "stand"\npose = "home"\nstep_s = 0.002\n[camera]\npresent = false\n')
     with virtual_robot(str(scenario), clock="stepped", camera=False) as found:
         yield found
 

@@ -484,7 +484,7 @@ def test_a_diagnosis_that_is_none_is_said_to_be_none(robot: RobotFolder) -> None
 @pytest.fixture(scope="module")
 def box() -> Iterator[Mapping[str, str | None]]:
     """Eight motors in their boxes, in stepped time."""
-    with virtual_robot(str(SCENARIOS / "loose.toml"), clock="stepped") as found:
+    with virtual_robot(str(SCENARIOS / "loose.toml"), clock="stepped", camera=False) as found:
         yield found
 
 
