@@ -3,12 +3,15 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN     = $(VENV)/bin
-# Errors only; and what is compiled is what is imported, when it is: a tenth of what these packages hold.
-INSTALL = $(BIN)/pip -qq --disable-pip-version-check --no-input install --root-user-action=ignore --no-compile -c constraints.txt
+# Errors only; and what is compiled is what is imported, when it is: a tenth of what these packages hold. pip finds the build of torch
+# that a machine has; all else uv unpacks in an eighth of pip's time.
+PIP = $(BIN)/pip -qq --disable-pip-version-check --no-input install --root-user-action=ignore --no-compile -c constraints.txt
+UV  = $(BIN)/uv -q pip install --python $(BIN)/python -c constraints.txt
 unexport PYTHONDONTWRITEBYTECODE
 DEMO   ?= demo-robot
-# two workers: what CI has, and any laptop; each begins with a half of the files, so that few prepare the same
-PYTEST_ARGS ?= -n 2 --dist worksteal
+# three workers on two cores, what CI has, and any laptop: a seventh of their time tests wait for what is timed; each begins with a
+# share of the files, so that few prepare the same
+PYTEST_ARGS ?= -n 3 --dist worksteal
 
 .PHONY: demo test lint types contracts pytest docs-check api ecosystem pictures rooms tour clean
 
@@ -39,12 +42,14 @@ pytest: $(VENV)/.dev
 $(VENV)/.all: pyproject.toml constraints.txt
 	@echo "Making an environment in $(VENV), once: a minute or two."
 	@$(PYTHON) -m venv $(VENV)
-	@$(INSTALL) -e '.[all]'
+	@$(PIP) torch uv
+	@$(UV) -e '.[all]'
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt
 	@$(PYTHON) -m venv $(VENV)
-	@$(INSTALL) -e '.[all,dev]'
+	@$(PIP) torch uv
+	@$(UV) -e '.[all,dev]'
 	@touch $@
 
 # Every command of README and docs/, page by page in one folder, on a virtual robot; `make test` runs those that are short.
