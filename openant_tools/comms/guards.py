@@ -27,7 +27,8 @@ class Guards:
         temperature_s: for how long it must read so: whoever soaks for hours meets answers with a wrong byte.
         silent_s: a servo that does not answer for so long is lost, once it has been asked `silent_cycles` times in
             vain, too: a noisy line loses answers by chance, a busy host asks seldom.
-        lost_s: a servo that does not answer for so long is lost, however often it was asked.
+        lost_s: a servo that does not answer for so long is lost, however often it was asked, if more than once: a single
+            answer is lost by chance, also after a pause in which nobody asked.
         behind_rad: how far a joint may stand from a command that rests, beside what its gain explains; None where something may
             rightly hold it back (a scale, a stop).
     """
@@ -107,6 +108,7 @@ class Watch:
         if (
             limit is None
             or silent < limit
+            or missed.total() < 2
             or (missed.total() < self.guards.silent_cycles and silent < self.guards.lost_s)
         ):
             return None

@@ -134,6 +134,9 @@ def test_a_busy_host_is_no_silent_servo() -> None:
     trip = watch.check(0.41, missed)
     assert trip is not None
     assert "hip_rr (id 10) has not answered for 0.41 s (2 × no answer)" in trip.what
+    watch.reset(0.0)
+    assert watch.check(1.0, missed) is None, "asked once in a second"
+    assert watch.check(1.01, missed) is not None
 
 
 def test_one_silent_servo_does_not_hide_those_behind_it() -> None:
