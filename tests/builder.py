@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+import pytest
 from readable import unreadable
 
 from openant_tools.bringup.simulated_builder import SimulatedBuilder
+from openant_tools.calib import wires
+from openant_tools.comms.setup import config_of_robot
 from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.step import (
     Answer,
@@ -27,12 +31,13 @@ from openant_tools.procedure.step import (
     drive,
 )  # fmt: skip
 from openant_tools.robot.folder import RobotFolder, create_robot
+from openant_tools.virtual import scenario
 from openant_tools.virtual.scenario import parse_scenario
 from openant_tools.virtual.server import Server
 from openant_tools.virtual.start import assemble
 
-#: of a scenario: pictures small enough that a test need not wait for them
-SMALL_PICTURES = "[camera]\nwidth = 640\nheight = 480\nfps = 15\n"
+#: of a scenario: pictures small and few enough that a test need not wait for them
+SMALL_PICTURES = "[camera]\nwidth = 640\nheight = 480\nfps = 8\n"
 #: s, of mechanics that a procedure watches, none of whose figures hang on them: twice as coarse as elsewhere
 COARSE_STEP_S = 0.002
 #: of a scenario: servos that rub enough for a calibration to be worth it, whatever noise there is
@@ -52,6 +57,18 @@ def finished(steps: Generator[Any, Any, T], said: list[str] | None = None) -> T:
             return result
         if said is not None and isinstance(event, Say):
             said.append(event.words)
+
+
+@contextlib.contextmanager
+def engine_rate(rate_hz: float) -> Iterator[None]:
+    """The engine of calibration goes round so many times a second: fewer packets than at 100, and every motion as long.
+
+    The mechanics of robots in this process, which have neither play nor springs, take steps of twice the length, too.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scenario, "STEP_S", COARSE_STEP_S)
+        patch.setattr(wires, "config_of_robot", functools.partial(config_of_robot, rate_hz=rate_hz))
+        yield
 
 
 class Builder:
@@ -155,8 +172,8 @@ def robot(folder: Path, *, sees: bool = False, kit: str = "standard", **table: A
     Its mechanics are left out while it stands still, and go by coarse steps, unless the tables say otherwise.
     """
     coarse = {} if "effect" in table else {"step_s": COARSE_STEP_S}
-    scenario = {"clock": {"doze": True}, **table, "robot": {**coarse, **table.get("robot", {})}}
-    server = assemble(parse_scenario(scenario), clock="stepped", camera=sees)
+    tables = {"clock": {"doze": True}, **table, "robot": {**coarse, **table.get("robot", {})}}
+    server = assemble(parse_scenario(tables), clock="stepped", camera=sees)
     stop = threading.Event()
     thread = threading.Thread(target=server.run, args=(stop.is_set,))
     thread.start()

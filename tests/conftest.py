@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import gc
 import os
 import tempfile
@@ -87,14 +86,17 @@ def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def half_rate() -> Iterator[None]:
-    """The engine of calibration goes round 50 times a second: half of the packets, and every motion as long.
+    """50 Hz instead of 100: as often as a slow sweep has to look to tell friction."""
+    from builder import engine_rate
 
-    The mechanics of robots in this process, which have neither play nor springs, take steps of twice the length, too.
-    """
-    from openant_tools.calib import wires
-    from openant_tools.virtual import scenario
+    with engine_rate(50.0):
+        yield
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scenario, "STEP_S", 2e-3)
-        patch.setattr(wires, "config_of_robot", functools.partial(wires.config_of_robot, rate_hz=50.0))
+
+@pytest.fixture(scope="module")
+def quarter_rate() -> Iterator[None]:
+    """25 Hz: enough where what counts is what is asked, said and written."""
+    from builder import engine_rate
+
+    with engine_rate(25.0):
         yield

@@ -31,7 +31,7 @@ from openant_tools.robot.folder import NOMINAL_MODEL, create_robot
 from openant_tools.sysid.bench.steps import floor_friction
 from openant_tools.thermal.step import thermal_soak
 
-pytestmark = pytest.mark.usefixtures("half_rate")
+pytestmark = pytest.mark.usefixtures("quarter_rate")
 
 #: steps that read or compute only: done again they ask nothing that was answered, and take a minute
 AT_ONCE = ("connect", "estop", "inventory", "gap", "passport")

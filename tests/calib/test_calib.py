@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from boards import TILTS, board_views
-from builder import robot
+from builder import engine_rate, robot
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -49,9 +49,16 @@ from openant_tools.robot.config import CameraSection, Provenance
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
 
-pytestmark = pytest.mark.usefixtures("half_rate")
+pytestmark = pytest.mark.usefixtures("quarter_rate")
 LOOSE = {"robot": {"setup": "loose"}}
 HIP = ("hip_rr",)
+
+
+@pytest.fixture
+def sweeping():
+    """What a slow sweep tells of friction, and which answers are lost, it tells at 50 Hz."""
+    with engine_rate(50.0):
+        yield
 
 
 # ---- connect, stop key ------------------------------------------------------------------------------------------------
@@ -367,7 +374,7 @@ def test_zeros_and_ranges_that_were_left_go_on_with_the_next_joint(tmp_path):
         assert "knee_rr has another zero than when it was moved; it is done again" in builder.said
 
 
-def test_bounds_that_were_left_after_the_sweep_do_not_sweep_again(tmp_path, brisk):
+def test_bounds_that_were_left_after_the_sweep_do_not_sweep_again(tmp_path, brisk, sweeping):
     with robot(tmp_path / "ant") as ant:
         with pytest.raises(KeyboardInterrupt):
             ant.do(bounds(ant.bench), ant.builder(before=leave_at(Progress, "trot")))
@@ -983,7 +990,7 @@ def test_a_servo_that_loses_answers_is_named(tmp_path):
         assert finding.problems[0].startswith("hip_fl:")
 
 
-def test_a_bus_that_loses_answers_of_all_servos_alike_blames_no_cable_of_one(tmp_path, brisk):
+def test_a_bus_that_loses_answers_of_all_servos_alike_blames_no_cable_of_one(tmp_path, brisk, sweeping):
     with robot(tmp_path / "ant", fault=[{"cause": "line_noise", "byte_error": 0.001}]) as ant:
         for step in (comms_health, bounds):
             finding, _ = ant.do(step(ant.bench))
