@@ -198,7 +198,8 @@ def _must_see(folder: RobotFolder | None, virtual_source: str | None, *, everywh
         ways = "record without the camera (--no-camera)" + (
             "" if everywhere else ", or on the stand alone (--setup stand)"
         )
-        raise type(error)(error.what, where=error.where, remedy=f"{error.remedy}; or {ways}") from None
+        error.remedy = "; or ".join(filter(None, (error.remedy, ways)))
+        raise
 
 
 def protocols_of(
