@@ -6,7 +6,7 @@ BIN     = $(VENV)/bin
 # Errors only; and what is compiled is what is imported, when it is: a tenth of what these packages hold. pip finds the build of torch
 # that a machine has; all else uv unpacks in an eighth of pip's time.
 PIP = $(BIN)/pip -qq --disable-pip-version-check --no-input install --root-user-action=ignore --no-compile -c constraints.txt
-UV  = $(BIN)/uv -q pip install --python $(BIN)/python -c constraints.txt
+UV  = $(BIN)/uv -q pip install --python $(BIN)/python -c constraints.txt -C editable_mode=compat
 unexport PYTHONDONTWRITEBYTECODE
 DEMO   ?= demo-robot
 # three workers on two cores, what CI has, and any laptop: a seventh of their time tests wait for what is timed; each begins with a
@@ -52,9 +52,10 @@ $(VENV)/.dev: pyproject.toml constraints.txt
 	@$(UV) -e '.[all,dev]'
 	@touch $@
 
-# Every command of README and docs/, page by page in one folder, on a virtual robot; `make test` runs those that are short.
+# Every command of README and docs/, page by page in one folder, on a virtual robot, and the whole walk by the screens; `make test`
+# runs of the pages what is short, and of the walk each step and what goes wrong there.
 docs-check: $(VENV)/.dev
-	$(BIN)/pytest $(PYTEST_ARGS) --long tests/docs
+	$(BIN)/pytest $(PYTEST_ARGS) --long tests/docs tests/tui/test_walk_screens.py
 
 # A page a module, from docstrings: build/api/index.html. A minute.
 api: $(VENV)/.dev

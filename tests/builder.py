@@ -36,8 +36,8 @@ from openant_tools.virtual.scenario import parse_scenario
 from openant_tools.virtual.server import Server
 from openant_tools.virtual.start import assemble
 
-#: of a scenario: pictures small and few enough that a test need not wait for them
-SMALL_PICTURES = "[camera]\nwidth = 640\nheight = 480\nfps = 8\n"
+#: of a scenario: pictures small enough that a test need not wait for them
+SMALL_PICTURES = "[camera]\nwidth = 640\nheight = 480\nfps = 15\n"
 #: s, of mechanics that a procedure watches, none of whose figures hang on them: twice as coarse as elsewhere
 COARSE_STEP_S = 0.002
 #: of a scenario: servos that rub enough for a calibration to be worth it, whatever noise there is

@@ -44,16 +44,24 @@ def pytest_collection() -> Generator[None, object, object]:
         return (yield)
     finally:
         gc.freeze()
+        gc.set_threshold(10_000)  # and of what tests make little is garbage
         gc.enable()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--long", action="store_true", help="run the blocks of docs/ that are marked long, too")
+    parser.addoption(
+        "--long", action="store_true", help="run what takes minutes, too, and the blocks of docs/ that are marked long"
+    )
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with what takes minutes, so that at the end no worker waits for another."""
-    items.sort(key=lambda item: item.get_closest_marker("minutes") is None)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what takes minutes, or begin with it, so that at the end no worker waits for another."""
+    if config.getoption("--long"):
+        items.sort(key=lambda item: item.get_closest_marker("minutes") is None)
+        return
+    for item in items:
+        if item.get_closest_marker("minutes") is not None:
+            item.add_marker(pytest.mark.skip(reason="takes minutes: run it with --long"))
 
 
 @pytest.fixture

@@ -36,7 +36,16 @@ from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.numbers import number, typed
 from openant_tools.optional import cv2
 
-__all__ = ["Camera", "CameraInfo", "CameraSetting", "CameraSettings", "CameraStatistics", "DropCounter", "Frame", "look"]
+__all__ = [
+    "Camera",
+    "CameraInfo",
+    "CameraSetting",
+    "CameraSettings",
+    "CameraStatistics",
+    "DropCounter",
+    "Frame",
+    "look",
+]
 
 Image = NDArray[np.uint8]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import math
 import subprocess
@@ -19,8 +20,10 @@ from walker import AGAIN, BY_ITSELF, Reply, Walker
 
 from openant_tools.bringup.persistent_robot import persistent_robot
 from openant_tools.bringup.walk import WALK, do, standing
+from openant_tools.calib import wires
 from openant_tools.cli import main
 from openant_tools.comms.clock import VirtualControl
+from openant_tools.comms.setup import config_of_robot
 from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.journal import Journal
 from openant_tools.procedure.step import Step
@@ -29,7 +32,7 @@ from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui.screens.walk import WalkScreen
 from openant_tools.virtual.process import VIRTUAL_DEFAULT, virtual_robot
 
-pytestmark = pytest.mark.usefixtures("half_rate")
+pytestmark = pytest.mark.usefixtures("quarter_rate")
 WIDE = (120, 40)
 BLIND = "[camera]\npresent = false\n"
 #: of a robot in a process of its own: its mechanics take steps twice as long as they do by themselves
@@ -243,6 +246,9 @@ def test_the_whole_walk_from_loose_motors_to_the_passport_and_on_to_learning(
     tmp_path: Path, brisk: None, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """By the command from the box to the built legs, where Ctrl-C ends it; from there by the screens; then it learns."""
+    monkeypatch.setattr(
+        wires, "config_of_robot", functools.partial(config_of_robot, rate_hz=50.0)
+    )  # which its sweeps need
     folder, given, report = tmp_path / "ant", tmp_path / "box.toml", tmp_path / "walk.json"
     left = '[[servo]]\njoint = "hip_fl"\nbaud = 4500000\n'  # somebody has played with one motor
     given.write_text(f'{COARSE}setup = "loose"\n[clock]\ndoze = true\n{SMALL_PICTURES}{RUBS}{left}')
