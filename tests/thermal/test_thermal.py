@@ -508,8 +508,8 @@ def test_a_stalled_robot_presses_until_a_servo_shuts_down(tmp_path: Path) -> Non
     assert made.joint.startswith("knee")
     assert "its limit is 72 °C" in made.words
     assert made.peak_c[made.joint] == 73
-    run = read_run(tmp_path / "stress.mcap", need=())
-    assert np.abs(run.column("pwm.knee_fl")[10]) == pytest.approx(0.5, abs=0.02)
+    duty = read_run(tmp_path / "stress.mcap", need=()).column("pwm.knee_fl")[10:]
+    assert np.abs(duty[np.isfinite(duty)][0]) == pytest.approx(0.5, abs=0.02)
 
 
 def test_the_walks_step_soaks_fits_and_finds(tmp_path: Path) -> None:
