@@ -27,8 +27,8 @@ class Guards:
         temperature_s: for how long it must read so: whoever soaks for hours meets answers with a wrong byte.
         silent_s: a servo that does not answer for so long is lost, once it has been asked `silent_cycles` times in
             vain, too: a noisy line loses answers by chance, a busy host asks seldom.
-        lost_s: a servo that does not answer for so long is lost, however often it was asked, if more than once: a single
-            answer is lost by chance, also after a pause in which nobody asked.
+        lost_s: a servo that does not answer for so long is lost, however often it was asked. A pause that is longer, in which nobody
+            was asked, is nobody's silence.
         behind_rad: how far a joint may stand from a command that rests, beside what its gain explains; None where something may
             rightly hold it back (a scale, a stop).
     """
@@ -79,16 +79,28 @@ class Watch:
     _hot_since: dict[int, float] = field(default_factory=dict)
     _heard: dict[int, float] = field(default_factory=dict)
     _missed: dict[int, Counter[Cause]] = field(default_factory=dict)
+    #: when all were asked last, s, and whether a pause was before that
+    _asked: float = 0.0
+    _paused: bool = False
 
     def reset(self, t: float) -> None:
         """Torque comes on at `t`: what was before does not count."""
         self._strained_since.clear()
         self._hot_since.clear()
+        self._paused = False
+        self._listen_from(t)
+
+    def _listen_from(self, t: float) -> None:
         self._missed.clear()
         self._heard = {servo.id: t for servo in self.servos}
+        self._asked = t
 
     def check(self, t: float, answers: Sequence[tuple[Answer, Block | None]]) -> Trip | None:
         """The first guard that trips on this cycle's answers at time `t`, if any."""
+        pause = t - self._asked > self.guards.lost_s
+        if pause and not self._paused:  # two in a row are slow questions
+            self._listen_from(t)
+        self._asked, self._paused = t, pause
         for servo, (answer, block) in zip(self.servos, answers, strict=True):
             if block is None:
                 trip = self._silence(t, servo, answer)
@@ -108,7 +120,6 @@ class Watch:
         if (
             limit is None
             or silent < limit
-            or missed.total() < 2
             or (missed.total() < self.guards.silent_cycles and silent < self.guards.lost_s)
         ):
             return None

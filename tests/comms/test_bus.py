@@ -136,7 +136,10 @@ def test_a_busy_host_is_no_silent_servo() -> None:
     assert "hip_rr (id 10) has not answered for 0.41 s (2 × no answer)" in trip.what
     watch.reset(0.0)
     assert watch.check(1.0, missed) is None, "asked once in a second"
-    assert watch.check(1.01, missed) is not None
+    assert watch.check(1.05, missed) is None, "a noisy line loses two in a row"
+    assert watch.check(1.41, missed) is not None
+    watch.reset(0.0)
+    assert [watch.check(0.5 * n, missed) is None for n in (1, 2, 3)] == [True, False, False], "asked twice a second"
 
 
 def test_one_silent_servo_does_not_hide_those_behind_it() -> None:
