@@ -28,7 +28,7 @@ class Guards:
         silent_s: a servo that does not answer for so long is lost, once it has been asked `silent_cycles` times in
             vain, too: a noisy line loses answers by chance, a busy host asks seldom.
         lost_s: a servo that does not answer for so long is lost, however often it was asked. A pause that is longer, in which nobody
-            was asked, is nobody's silence.
+            was asked, is no silence, once until it answers: more of them are slow questions.
         behind_rad: how far a joint may stand from a command that rests, beside what its gain explains; None where something may
             rightly hold it back (a scale, a stop).
     """
@@ -79,34 +79,34 @@ class Watch:
     _hot_since: dict[int, float] = field(default_factory=dict)
     _heard: dict[int, float] = field(default_factory=dict)
     _missed: dict[int, Counter[Cause]] = field(default_factory=dict)
-    #: when all were asked last, s, and whether a pause was before that
+    #: when all were asked last, s, and who has not answered since a pause before that
     _asked: float = 0.0
-    _paused: bool = False
+    _excused: set[int] = field(default_factory=set)
 
     def reset(self, t: float) -> None:
         """Torque comes on at `t`: what was before does not count."""
         self._strained_since.clear()
         self._hot_since.clear()
-        self._paused = False
-        self._listen_from(t)
-
-    def _listen_from(self, t: float) -> None:
         self._missed.clear()
+        self._excused.clear()
         self._heard = {servo.id: t for servo in self.servos}
         self._asked = t
 
     def check(self, t: float, answers: Sequence[tuple[Answer, Block | None]]) -> Trip | None:
         """The first guard that trips on this cycle's answers at time `t`, if any."""
-        pause = t - self._asked > self.guards.lost_s
-        if pause and not self._paused:  # two in a row are slow questions
-            self._listen_from(t)
-        self._asked, self._paused = t, pause
+        if t - self._asked > self.guards.lost_s:
+            for id in {servo.id for servo in self.servos} - self._excused:
+                self._heard[id] = t
+                self._missed.pop(id, None)
+                self._excused.add(id)
+        self._asked = t
         for servo, (answer, block) in zip(self.servos, answers, strict=True):
             if block is None:
                 trip = self._silence(t, servo, answer)
             else:
                 self._heard[servo.id] = t
                 self._missed.pop(servo.id, None)
+                self._excused.discard(servo.id)
                 trip = self._measured(t, servo, answer, block)
             if trip is not None:
                 return trip

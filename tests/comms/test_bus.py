@@ -140,6 +140,8 @@ def test_a_busy_host_is_no_silent_servo() -> None:
     assert watch.check(1.41, missed) is not None
     watch.reset(0.0)
     assert [watch.check(0.5 * n, missed) is None for n in (1, 2, 3)] == [True, False, False], "asked twice a second"
+    watch.reset(0.0)
+    assert [watch.check(t, missed) is None for t in (0.5, 0.52, 1.02)] == [True, True, False], "now slowly, now at once"
 
 
 def test_one_silent_servo_does_not_hide_those_behind_it() -> None:
