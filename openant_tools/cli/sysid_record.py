@@ -139,19 +139,17 @@ def record(
         [take for take in wanted if (take.protocol.setup, take.protocol.heading_rad) == place]
         for place in dict.fromkeys((take.protocol.setup, take.protocol.heading_rad) for take in wanted)
     ]
-    if any(_looks(place[0].protocol, camera, record_pictures) for place in placements):
-        _must_see(folder, virtual_source, everywhere=bool(camera) or record_pictures)
     # A virtual robot that is started here is put where it is needed; any other, and a real one, needs hands.
     moves_itself = virtual_source is not None and placeable(virtual_source)
+    if placements[1:] and not moves_itself and (yes or not has_terminal()):
+        rest = "; ".join(_where(later[0].protocol) for later in placements[1:])
+        console.print(f"left out, since nobody is asked to move the robot: {rest}; record it with --setup floor")
+        del placements[1:]
+    if any(_looks(place[0].protocol, camera, record_pictures) for place in placements):
+        _must_see(console, folder, virtual_source, everywhere=bool(camera) or record_pictures)
     for k, place in enumerate(placements):
         protocol = place[0].protocol
         if k and not moves_itself:
-            if yes or not has_terminal():
-                rest = "; ".join(_where(later[0].protocol) for later in placements[k:])
-                console.print(
-                    f"left out, since nobody is asked to move the robot: {rest}; record it with --setup floor"
-                )
-                break
             click.confirm(f"Put the robot {_where(protocol)}. Ready?", abort=True, err=True)
         with contextlib.ExitStack() as stack:
             source = virtual_source
@@ -172,7 +170,7 @@ def _looks(protocol: Protocol, camera: bool | None, pictures: bool) -> bool:
     return pictures or (protocol.setup == "floor" if camera is None else camera)
 
 
-def _must_see(folder: RobotFolder | None, virtual_source: str | None, *, everywhere: bool) -> None:
+def _must_see(console: Console, folder: RobotFolder | None, virtual_source: str | None, *, everywhere: bool) -> None:
     """Before anything moves: what is played last may be the first to look through the camera.
 
     Args:
@@ -193,6 +191,7 @@ def _must_see(folder: RobotFolder | None, virtual_source: str | None, *, everywh
         if camera is not None and virtual_source is None:
             from openant_tools.comms.camera import look  # not without OpenCV
 
+            console.print(f"looking through the camera {camera.settings.name}")
             look(camera.settings, RealClock())
     except OpenAntError as error:
         ways = "record without the camera (--no-camera)" + (

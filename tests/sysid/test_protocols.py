@@ -289,10 +289,14 @@ def test_a_camera_that_shows_nothing_is_told_before_the_robot_moves(tmp_path: Pa
     camera = str(tmp_path / "video9")
     folder = create_robot(tmp_path / "ant", values={"camera.body_tag_id": 12, "ports.camera": camera}).path
     arguments = ["--port", "/dev/ttyUSB9", "--robot", str(folder), "--out", str(tmp_path / "run.mcap"), "--yes"]
-    result = CliRunner().invoke(record, arguments)
+    result = CliRunner().invoke(record, [*arguments, "--setup", "floor"])
     assert isinstance(result.exception, HardwareFault)
     assert camera in str(result.exception)
     assert "--no-camera" in str(result.exception)
+    # Nobody is asked to put it on the floor, and on the stand the camera is not needed.
+    result = CliRunner().invoke(record, arguments)
+    assert "left out, since nobody is asked to move the robot: on the floor" in result.stderr
+    assert "/dev/ttyUSB9" in str(result.exception)
 
 
 def test_a_plan_is_played_with_legs_released_and_caught_then_on_the_floor(tmp_path: Path) -> None:
