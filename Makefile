@@ -7,6 +7,7 @@ BIN     = $(VENV)/bin
 # that a machine has; all else uv unpacks in an eighth of pip's time.
 PIP = $(BIN)/pip -qq --disable-pip-version-check --no-input install --root-user-action=ignore --no-compile -c constraints.txt
 UV  = $(BIN)/uv -q pip install --python $(BIN)/python -c constraints.txt -C editable_mode=compat
+INSTALL = $(PYTHON) -m venv $(VENV) && $(PIP) torch uv && $(UV) -e
 unexport PYTHONDONTWRITEBYTECODE
 DEMO   ?= demo-robot
 # three workers on two cores, what CI has, and any laptop: a seventh of their time tests wait for what is timed; each begins with a
@@ -41,15 +42,11 @@ pytest: $(VENV)/.dev
 # Torch comes first and by name: the constraint names the CPU build's version, which any platform can satisfy.
 $(VENV)/.all: pyproject.toml constraints.txt
 	@echo "Making an environment in $(VENV), once: a minute or two."
-	@$(PYTHON) -m venv $(VENV)
-	@$(PIP) torch uv
-	@$(UV) -e '.[all]'
+	@$(INSTALL) '.[all]'
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt
-	@$(PYTHON) -m venv $(VENV)
-	@$(PIP) torch uv
-	@$(UV) -e '.[all,dev]'
+	@$(INSTALL) '.[all,dev]'
 	@touch $@
 
 # Every command of README and docs/, page by page in one folder, on a virtual robot, and the whole walk by the screens; `make test`

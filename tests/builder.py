@@ -31,7 +31,6 @@ from openant_tools.procedure.step import (
     drive,
 )  # fmt: skip
 from openant_tools.robot.folder import RobotFolder, create_robot
-from openant_tools.virtual import scenario
 from openant_tools.virtual.scenario import parse_scenario
 from openant_tools.virtual.server import Server
 from openant_tools.virtual.start import assemble
@@ -40,6 +39,8 @@ from openant_tools.virtual.start import assemble
 SMALL_PICTURES = "[camera]\nwidth = 640\nheight = 480\nfps = 15\n"
 #: s, of mechanics that a procedure watches, none of whose figures hang on them: twice as coarse as elsewhere
 COARSE_STEP_S = 0.002
+#: of a scenario: the same; what belongs to the robot may follow
+COARSE = f"[robot]\nstep_s = {COARSE_STEP_S}\n"
 #: of a scenario: servos that rub enough for a calibration to be worth it, whatever noise there is
 RUBS = "[motor]\ncoulomb_nm = 0.09\n"
 
@@ -61,14 +62,15 @@ def finished(steps: Generator[Any, Any, T], said: list[str] | None = None) -> T:
 
 @contextlib.contextmanager
 def engine_rate(rate_hz: float) -> Iterator[None]:
-    """The engine of calibration goes round so many times a second: fewer packets than at 100, and every motion as long.
-
-    The mechanics of robots in this process, which have neither play nor springs, take steps of twice the length, too.
-    """
+    """The engine of calibration goes round so many times a second: fewer packets than at 100, and every motion as long."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scenario, "STEP_S", COARSE_STEP_S)
         patch.setattr(wires, "config_of_robot", functools.partial(config_of_robot, rate_hz=rate_hz))
         yield
+
+
+def coarsen(model: Path) -> None:
+    """Let a nominal model take the steps of a coarse robot, to which it is to be fitted."""
+    model.write_text(model.read_text().replace('timestep="0.001"', f'timestep="{COARSE_STEP_S}"', 1))
 
 
 class Builder:

@@ -44,7 +44,6 @@ def pytest_collection() -> Generator[None, object, object]:
         return (yield)
     finally:
         gc.freeze()
-        gc.set_threshold(10_000)  # and of what tests make little is garbage
         gc.enable()
 
 
@@ -95,6 +94,15 @@ def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def half_rate() -> Iterator[None]:
     """50 Hz instead of 100: as often as a slow sweep has to look to tell friction."""
+    from builder import engine_rate
+
+    with engine_rate(50.0):
+        yield
+
+
+@pytest.fixture
+def sweeping() -> Iterator[None]:
+    """The same for a test whose module needs less."""
     from builder import engine_rate
 
     with engine_rate(50.0):

@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 ENCODER_RAD = 2 * np.pi / 4096
 
 SERVO = 'name="joint" joint="joint"'
+#: options of a model that a fit simulates a thousand times: as large steps as the pendulum's own dynamics allow
+COARSE = 'timestep="0.002" integrator="implicitfast"'
 
 
 #: of the world: what falls below the pendulum would land on it; on a stand nothing does

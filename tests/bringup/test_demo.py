@@ -15,6 +15,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from builder import COARSE, coarsen
 
 from openant_env import rendering
 from openant_tools.bringup import robot_picture
@@ -44,7 +45,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Demo:
     """A demo that has gone the whole way, with robot and model in steps of 2 ms."""
     demo = small(tmp_path_factory.mktemp("demo") / "ant")
     demo.prepare()
-    demo.scenario.write_text(demo.scenario.read_text().replace("[robot]\n", "[robot]\nstep_s = 0.002\n", 1))
+    demo.scenario.write_text(demo.scenario.read_text().replace("[robot]\n", COARSE, 1))
     for stage in demo.stages():
         assert not demo.stands(stage)
         shares: list[float] = []
@@ -53,7 +54,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Demo:
         assert shares == sorted(shares)
         assert stage.name == "robot" or 0.9 < shares[-1] <= 1.0, stage.name
         if stage.name == "robot":
-            demo.nominal.write_text(demo.nominal.read_text().replace('timestep="0.001"', 'timestep="0.002"', 1))
+            coarsen(demo.nominal)
     demo_figures = write_report(demo)
     (demo.folder / "figures.json").write_text(json.dumps(demo_figures))
     return demo

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from builder import Builder, Robot, robot
+from builder import Builder, Robot, coarsen, robot
 
 from openant_tools.bringup.comms_step import comms_step
 from openant_tools.bringup.identification import identification
@@ -145,8 +145,7 @@ def test_motions_that_were_recorded_are_not_played_again_unless_the_robot_is_ano
     tmp_path: Path, brisk: None
 ) -> None:
     with robot(tmp_path / "ant", motor={"coulomb_nm": 0.09}) as there:
-        nominal = there.folder.path / NOMINAL_MODEL  # what is fitted takes the robot's own steps
-        nominal.write_text(nominal.read_text().replace('timestep="0.001"', 'timestep="0.002"', 1))
+        coarsen(there.folder.path / NOMINAL_MODEL)
         note = left(
             there,
             identification,

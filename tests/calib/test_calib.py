@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from boards import TILTS, board_views
-from builder import engine_rate, robot
+from builder import robot
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -52,13 +52,6 @@ from openant_tools.robot.joints import JOINT_NAMES, JOINTS
 pytestmark = pytest.mark.usefixtures("quarter_rate")
 LOOSE = {"robot": {"setup": "loose"}}
 HIP = ("hip_rr",)
-
-
-@pytest.fixture
-def sweeping():
-    """What a slow sweep tells of friction, and which answers are lost, it tells at 50 Hz."""
-    with engine_rate(50.0):
-        yield
 
 
 # ---- connect, stop key ------------------------------------------------------------------------------------------------
@@ -646,7 +639,7 @@ def test_a_wrong_spline_a_mirrored_leg_and_exchanged_ids_are_all_named(tmp_path)
 
 def test_a_leg_that_is_not_straight_is_named(tmp_path):
     crooked = [{"effect": "zero_offset", "joints": ["knee_rr"], "parameters": {"angle_rad": 0.3}}]
-    with robot(tmp_path / "ant", effect=crooked, robot={"step_s": 1e-3}) as ant:
+    with robot(tmp_path / "ant", effect=crooked) as ant:
         finding, _ = ant.do(zeros(replace(ant.bench, joints=("knee_rr",))))
         assert not finding.ok
         assert "knee_rr: +17.2° beside the grid" in finding.problems[0]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builder import finished
+from builder import COARSE, finished
 from click.testing import CliRunner
 
 from openant_tools.blind.soak_virtual import swinging_soak
@@ -102,7 +102,7 @@ BYTES: dict[str, tuple[dict[str, Any], float, float]] = {
 def stepped_robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mapping[str, str | None]]:
     """A healthy robot, whose mechanics take longer steps than by themselves: it is the bus that is looked at."""
     scenario = tmp_path_factory.mktemp("healthy") / "healthy.toml"
-    scenario.write_text("[robot]\nstep_s = 0.002\n")
+    scenario.write_text(COARSE)
     with virtual_robot(str(scenario), clock="stepped", camera=False) as found:
         yield found
 

@@ -21,6 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from builder import COARSE
 
 from openant_tools.comms import engine_process, messages
 from openant_tools.comms.clock import VirtualControl
@@ -46,7 +47,7 @@ PATIENCE_S = 20.0
 
 def start(folder: Path, clock: str) -> Iterator[dict[str, str]]:
     scenario = folder / "blind.toml"
-    scenario.write_text("[robot]\nstep_s = 0.002\n[camera]\npresent = false\n[clock]\ndoze = true\n")
+    scenario.write_text(f"{COARSE}[camera]\npresent = false\n[clock]\ndoze = true\n")
     with virtual_robot(str(scenario), clock=clock) as robot:
         yield dict(robot)  # type: ignore[arg-type]
 

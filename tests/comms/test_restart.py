@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from builder import finished
+from builder import COARSE, finished
 from click.testing import CliRunner
 from places import ROOT
 
@@ -49,7 +49,7 @@ FOR_GOOD = ("storage", "limits", "port", "guardian", "fall", "by_hand", "unknown
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     scenario = tmp_path_factory.mktemp("scenario") / "blind.toml"
-    scenario.write_text("[robot]\nstep_s = 0.002\n[camera]\npresent = false\n[clock]\ndoze = true\n")
+    scenario.write_text(f"{COARSE}[camera]\npresent = false\n[clock]\ndoze = true\n")
     with virtual_robot(str(scenario), clock="stepped") as found:
         yield dict(found)  # type: ignore[arg-type]
 

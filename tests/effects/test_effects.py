@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from plants import ENCODER_RAD, drive, pendulum, sweep, write
+from plants import COARSE, ENCODER_RAD, drive, pendulum, sweep, write
 
 from openant_tools.cli.sysid_fit import fit
 from openant_tools.effects.acting import Acting
@@ -45,8 +45,6 @@ SHOWING = {
     ("viscous_nonlinear", "coefficients"): 0.05,
     ("voltage_sag", "resistance_ohm"): 2.0,
 }
-#: as large steps as the pendulum's own dynamics allow, where a fit simulates it a thousand times
-COARSE = 'timestep="0.002" integrator="implicitfast"'
 
 
 def recorded(plant: Plant, seconds: float = 2.0, limp: bool = False) -> Run:

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import plants
 import pytest
-from plants import ENCODER_RAD, pendulum, sweep, write
+from plants import COARSE, ENCODER_RAD, pendulum, sweep, write
 
 import openant_env  # noqa: F401  (registers the environments)
 from openant_tools import sysid
@@ -50,11 +50,7 @@ def command(*words: object) -> int:
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    text = (
-        pendulum(option='timestep="0.002" integrator="implicitfast"')
-        .replace('name="joint"', 'name="knee_fl"')
-        .replace('joint="joint"', 'joint="knee_fl"')
-    )
+    text = pendulum(option=COARSE).replace('name="joint"', 'name="knee_fl"').replace('joint="joint"', 'joint="knee_fl"')
     return write(tmp_path_factory.mktemp("given") / "pendulum.xml", text)
 
 

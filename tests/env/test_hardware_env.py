@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from builder import COARSE
 from gymnasium.utils.env_checker import check_env
 from killing import FLOOR
 
@@ -37,10 +38,7 @@ from openant_tools.robot.derating import derating_of
 from openant_tools.robot.folder import RobotFolder, create_robot
 
 #: fewer pictures and longer steps of its mechanics than it has by itself: it walks no better or worse
-SCENARIO = (
-    FLOOR.replace("[robot]", "[robot]\nstep_s = 0.002").replace("fps = 12.0", "fps = 8.0")
-    + '[clock]\nmode = "stepped"\n'
-)
+SCENARIO = FLOOR.replace("[robot]\n", COARSE).replace("fps = 12.0", "fps = 8.0") + '[clock]\nmode = "stepped"\n'
 STILL = np.zeros(8, np.float32)
 RULE = {"start_c": 62.0, "stop_c": 70.0, "least": 0.4}
 

@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from plants import BENCH, ENCODER_RAD, drive, pendulum, run_of, sweep, write
+from plants import BENCH, COARSE, ENCODER_RAD, drive, pendulum, run_of, sweep, write
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from openant_tools.errors import BadInput
@@ -21,7 +21,6 @@ from openant_tools.gap.words import sentence, sizes, standing
 from openant_tools.recording.run import Run
 
 RATE_HZ = 50
-OPTION = 'timestep="0.002" integrator="implicitfast"'
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -32,7 +31,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write(tmp_path_factory.mktemp("model") / "pendulum.xml", pendulum(option=OPTION))
+    return write(tmp_path_factory.mktemp("model") / "pendulum.xml", pendulum(option=COARSE))
 
 
 def recorded(text: str, late_s: float = 0.0) -> list[Run]:

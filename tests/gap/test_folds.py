@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from places import SHARED
-from plants import BENCH, ENCODER_RAD, SERVO, drive, pendulum, run_of, sweep, write
+from plants import BENCH, COARSE, ENCODER_RAD, SERVO, drive, pendulum, run_of, sweep, write
 
 from openant_tools.gap.assess import assess
 from openant_tools.gap.experiment import Experiment
@@ -22,8 +22,6 @@ from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run
 
 RATE_HZ = 50
-#: what fits simulate a thousand times; robots are played by finer steps
-COARSE = 'timestep="0.002" integrator="implicitfast"'
 REAL = SHARED / "realdata" / "bam-xl330"
 #: the given model has all of its damping in the joint and no friction; the robot's is back-EMF, and it rubs
 GIVEN = pendulum(

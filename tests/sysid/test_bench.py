@@ -11,7 +11,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from builder import Builder
+from builder import COARSE, Builder
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -218,7 +218,7 @@ def held(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     folder = tmp_path_factory.mktemp("held")
     scenario = folder / "held.toml"
     scenario.write_text(
-        '[robot]\nsetup = "stand"\npose = "home"\nstep_s = 0.002\n'
+        f'{COARSE}setup = "stand"\npose = "home"\n'
         "[motor]\np_divisor = 256.0\n"
         '[[effect]]\neffect = "floor_tilt"\nparameters = { angle_rad = 0.2 }\n'
         '[[effect]]\neffect = "blocked_joint"\njoints = ["knee_fl"]\nparameters = { angle_rad = -0.87 }\n'

@@ -40,7 +40,7 @@ NOISE = 3e-4
 #: what no model can beat: an encoder of 4096 steps a turn, and the noise before it
 FLOOR = math.hypot(plants.ENCODER_RAD / math.sqrt(12), NOISE)
 #: the fit's step; the robots below are stepped sixteen times as finely, by another integrator
-MODEL = plants.pendulum(option='timestep="0.002" integrator="implicitfast"')
+MODEL = plants.pendulum(option=plants.COARSE)
 GIVEN = {"stiffness": 8.0, "damping": 0.12, "armature": 0.006, "coulomb_friction": 0.03, "zero_offset": 0.0}
 
 

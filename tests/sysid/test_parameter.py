@@ -36,7 +36,7 @@ from openant_tools.sysid.protocols import CommandSpace, protocol
 from openant_tools.sysid.result import write_fit, write_robot
 
 #: the fit's step; what is recorded is stepped sixteen times as finely
-MODEL = plants.pendulum(option='timestep="0.002" integrator="implicitfast"')
+MODEL = plants.pendulum(option=plants.COARSE)
 
 
 @pytest.fixture

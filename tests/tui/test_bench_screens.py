@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import walker
+from builder import COARSE
 from walker import Reply, Walker
 
 from openant_tools.bringup.walk import BENCH
@@ -25,7 +26,7 @@ SIZE = (80, 24)
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mapping[str, str | None]]:
     """A healthy robot on its stand, in stepped time."""
     scenario = tmp_path_factory.mktemp("bench") / "stand.toml"
-    scenario.write_text('[robot]\nsetup = "stand"\npose = "home"\nstep_s = 0.002\n[camera]\npresent = false\n')
+    scenario.write_text(f'{COARSE}setup = "stand"\npose = "home"\n[camera]\npresent = false\n')
     with virtual_robot(str(scenario), clock="stepped", camera=False) as found:
         yield found
 

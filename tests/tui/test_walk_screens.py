@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
 import math
 import subprocess
@@ -15,15 +14,13 @@ from typing import Any
 
 import pytest
 import walker
-from builder import RUBS, SMALL_PICTURES
+from builder import COARSE, RUBS, SMALL_PICTURES, coarsen
 from walker import AGAIN, BY_ITSELF, Reply, Walker
 
 from openant_tools.bringup.persistent_robot import persistent_robot
 from openant_tools.bringup.walk import WALK, do, standing
-from openant_tools.calib import wires
 from openant_tools.cli import main
 from openant_tools.comms.clock import VirtualControl
-from openant_tools.comms.setup import config_of_robot
 from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.journal import Journal
 from openant_tools.procedure.step import Step
@@ -35,8 +32,6 @@ from openant_tools.virtual.process import VIRTUAL_DEFAULT, virtual_robot
 pytestmark = pytest.mark.usefixtures("quarter_rate")
 WIDE = (120, 40)
 BLIND = "[camera]\npresent = false\n"
-#: of a robot in a process of its own: its mechanics take steps twice as long as they do by themselves
-COARSE = "[robot]\nstep_s = 0.002\n"
 
 
 @dataclass
@@ -243,12 +238,9 @@ def test_a_tag_of_another_size_is_named_on_the_screen(tmp_path: Path, brisk: Non
 @pytest.mark.minutes
 @pytest.mark.timeout(1800)
 def test_the_whole_walk_from_loose_motors_to_the_passport_and_on_to_learning(
-    tmp_path: Path, brisk: None, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, brisk: None, sweeping: None, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """By the command from the box to the built legs, where Ctrl-C ends it; from there by the screens; then it learns."""
-    monkeypatch.setattr(
-        wires, "config_of_robot", functools.partial(config_of_robot, rate_hz=50.0)
-    )  # which its sweeps need
     folder, given, report = tmp_path / "ant", tmp_path / "box.toml", tmp_path / "walk.json"
     left = '[[servo]]\njoint = "hip_fl"\nbaud = 4500000\n'  # somebody has played with one motor
     given.write_text(f'{COARSE}setup = "loose"\n[clock]\ndoze = true\n{SMALL_PICTURES}{RUBS}{left}')
@@ -274,9 +266,7 @@ def test_the_whole_walk_from_loose_motors_to_the_passport_and_on_to_learning(
     states = {name: now.state for name, now in standing(RobotFolder.at(folder)).items()}
     assert states == dict.fromkeys(built, "ok") | dict.fromkeys(rest, "todo"), words[-4000:]
 
-    # What is fitted takes the robot's own steps.
-    nominal = folder / "nominal.xml"
-    nominal.write_text(nominal.read_text().replace('timestep="0.001"', 'timestep="0.002"', 1))
+    coarsen(folder / "nominal.xml")
     said = dict[str, str]()
 
     async def walk(walker: Walker) -> None:
