@@ -6,6 +6,7 @@ write to two at once is heard by both.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,11 +14,13 @@ from openant_tools.calib.mute import scan_and_mend
 from openant_tools.calib.wires import BOOT_S, bare_config, journalled, opened_bus, wait
 from openant_tools.comms import messages
 from openant_tools.comms.bus import Bus
+from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.scan import BAUDS, Scan, Scanned, scan
 from openant_tools.comms.servos import Servo, Servos
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import (
+    Answer,
     Ask,
     Bench,
     Hands,
@@ -46,7 +49,7 @@ NUDGE_PWM = 0.2
 PARKING = range(200, 240)
 BLINKS, BLINK_S = 3, 0.15
 SETTLE_S = 0.3
-AGAIN, LEAVE = "try again", "leave it"
+AGAIN, LEAVE, NONE = "try again", "leave it", "none of them"
 
 
 @dataclass(frozen=True)
@@ -224,17 +227,23 @@ def _rename_to(bench: Bench, bus: Bus, servos: Servos, motor: MotorSection, conf
     return servos
 
 
-def nudge(bench: Bench, servo: Servo, baud: int, angle_rad: float = NUDGE_RAD) -> Subroutine[float]:
-    """Blink the LED, turn by `angle_rad` and back with little force; how far it went, rad. Torque is off afterwards.
+def nudge(
+    bench: Bench, servo: Servo, baud: int, angle_rad: float = NUDGE_RAD
+) -> Subroutine[tuple[float, frozenset[str]]]:
+    """Blink the LED, turn by `angle_rad` and back with little force. Torque is off afterwards.
+
+    Returns how far it went, rad, and which joints of a virtual robot were seen to blink: a real one's only the builder sees.
 
     Raises:
         HardwareFault: it does not answer, or a guard stopped it.
     """
     config = bare_config(bench, [servo], baud)
+    blinked = set[str]()
     with EngineProcess(config) as engine:
         for _ in range(BLINKS):
             for on in (1, 0):
                 engine.ask(messages.WriteRegister(servo.joint, "led", on))
+                blinked |= _lit(bench) if on else set()
                 engine.ask(messages.LetPass(BLINK_S))
         start = engine.ask(messages.Torque(True))
         engine.ask(messages.WriteRegister(servo.joint, "goal_pwm", round(NUDGE_PWM * PWM_FULL)))
@@ -250,7 +259,15 @@ def nudge(bench: Bench, servo: Servo, baud: int, angle_rad: float = NUDGE_RAD) -
         yield Live({servo.joint: went}, "rad", "nudged by")
         engine.ask(messages.Ramp(start))
         engine.ask(messages.Hold(SETTLE_S))
-    return abs(went)
+    return abs(went), frozenset(blinked)
+
+
+def _lit(bench: Bench) -> set[str]:
+    """Joints of a virtual robot whose LED is on now."""
+    if bench.control is None:
+        return set()
+    with contextlib.closing(VirtualControl(bench.control)) as eyes:
+        return set(eyes.ask("look")["lit"])
 
 
 # ---- servos that are wired already -----------------------------------------------------------------------------------
@@ -262,14 +279,18 @@ def _rename(bench: Bench, found: Scan, motors: Sequence[MotorSection], config: R
     chosen: dict[str, Scanned] = {}
     for one in found.servos:
         yield Intent(f"blink the LED of id {one.id} and nudge its horn, to see which joint it is", moves=True)
-        yield from nudge(bench, Servo(f"id {one.id}", one.id, servo_model(one.model_number)), one.baud, 0.06)
+        servo = Servo(f"id {one.id}", one.id, servo_model(one.model_number))
+        _, blinked = yield from nudge(bench, servo, one.baud, 0.06)
         fits = [joint for joint in left if config.motors[joint].servo.number == one.model_number]
-        own = config.motor_with_id(one.id)
-        guess = own.joint if own is not None and own.joint in fits else fits[0] if fits else "none of them"
         question = f"Which joint is id {one.id} ({one.model})?"
+        answer: Answer
         if bench.virtual:
-            question += " (this robot is virtual: pretend that you see it)"
-        answer = yield Ask(question, (*fits, "none of them"), default=guess)
+            answer = next((joint for joint in fits if joint in blinked), NONE)
+            yield Say(f"{question} {answer} (this robot is virtual: it looked itself which one blinked)")
+        else:
+            own = config.motor_with_id(one.id)
+            guess = own.joint if own is not None and own.joint in fits else fits[0] if fits else NONE
+            answer = yield Ask(question, (*fits, NONE), default=guess)
         if isinstance(answer, str) and answer in left:
             chosen[answer] = one
             left.remove(answer)

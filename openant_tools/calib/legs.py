@@ -119,7 +119,7 @@ def _one(bench: Bench, leg: Leg, config: RobotConfig) -> Subroutine[tuple[list[E
     yield Intent(f"nudge {' and '.join(joints)} by {number(NUDGE_RAD, 'rad', decimals=0)}, gently", moves=True)
     for servo in robot_servos(config, joints):  # told from the zero that they had while hands moved them
         joint = servo.joint
-        went = yield from nudge(bench, servo, config.bus.baud, NUDGE_RAD)
+        went, _ = yield from nudge(bench, servo, config.bus.baud, NUDGE_RAD)
         evidence.append(Evidence(f"nudge of {joint}", went, "rad", "encoder", least=NUDGED_RAD))
         if went < NUDGED_RAD:
             raise HardwareFault(

@@ -23,6 +23,7 @@ The control socket (Unix stream, one JSON object a line, one line of answer each
 | | to go on, to when it does, which is `t` |
 | `{"do": "state"}` | the truth: angles, torques, temperatures, torque enables, supply, body; not where it is sealed |
 | `{"do": "wiring"}` | `{"chain": [[joint, …], …]}`, each cable from the adapter outwards |
+| `{"do": "look"}` | what eyes beside it see: `{"lit": [joint, …]}`, the servos whose LED is on |
 | `{"do": "fault", "cause": …, "where": …, "on": bool, …}` | switches a fault; `{"t": s}` |
 | `{"do": "plug", "joint": …}`, `{"do": "unplug", …}` | puts a servo on the bus or takes it off; `{"t": s}` |
 | `{"do": "assemble", "setup": "stand"}` | builds the robot from the motors in the box, or puts it on "floor" or stand |
@@ -516,6 +517,8 @@ class Server:
         if do == "wiring":
             joints, chains = self.world.joints, self.world.line.settings.chains
             return {"chain": [[joints[k] for k in chain] for chain in chains]}
+        if do == "look":
+            return {"lit": self.world.lit}
         if do == "fault":
             if self.fault is None:
                 raise _Failed("this robot has no faults to switch")
@@ -551,8 +554,8 @@ class Server:
             )
             return {"t": self.now}
         raise _Failed(
-            f"no such request: {do!r} (now, open, advance, settle, wait, state, wiring, fault, plug, unplug, assemble, turn, "
-            "let_go, tilt, put)"
+            f"no such request: {do!r} (now, open, advance, settle, wait, state, wiring, look, fault, plug, unplug, assemble, "
+            "turn, let_go, tilt, put)"
         )
 
     def _arrive(self, control: _Control, request: dict[str, Any]) -> None:

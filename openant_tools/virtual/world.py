@@ -329,6 +329,12 @@ class World:
 
     # ---- what is true ----
 
+    @property
+    def lit(self) -> list[str]:
+        """Joints whose servo's LED is on."""
+        pairs = zip(self.joints, self.servos, strict=True)
+        return [joint for joint, servo in pairs if servo.powered and servo.get("led")]
+
     def state(self) -> dict[str, Any]:
         """The truth behind the sensors, for tests and people: rad, rad/s, N·m, A, V, °C, m."""
         drives, body = self.drives, self.body

@@ -228,6 +228,21 @@ def test_wired_servos_whose_ids_are_exchanged_are_renamed_without_ever_clashing(
         assert "Which joint is id 50" in builder.said
 
 
+def test_a_virtual_robot_looks_itself_which_wired_servo_blinked(tmp_path):
+    """Also where the first that would fit is another, and where the robot keeps its truth to itself."""
+    mixed = [{"joint": "hip_rl", "id": 50}, {"joint": "hip_rr", "id": 51}, {"joint": "knee_fl", "id": 10}]
+    with robot(tmp_path / "ant", servo=mixed) as ant:
+        ant.server.sealed = True
+        finding, builder = ant.do(ids(ant.bench))
+        assert finding.ok, finding
+        assert [event.question for event in builder.events if isinstance(event, Ask)] == [
+            "8 servos answer under ids of their own: rename them as they are wired, or set bare servos up one at a time?"
+        ]
+        assert "Which joint is id 50 (XC430-W240-T)? hip_rl (this robot is virtual: it looked" in builder.said
+        assert [ant.register(joint, "id") for joint in JOINT_NAMES] == [joint.id for joint in JOINTS.values()]
+        assert not any(ant.torque())
+
+
 # ---- centring, legs ---------------------------------------------------------------------------------------------------
 
 
