@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_agents.learner import Job, SharedWeights
-from openant_agents.runs import has_checkpoint
+from openant_agents.runs import has_checkpoint, making_sense
 from openant_agents.sac import CURVE_EVERY, Sac, SacSettings, device_of, learned_by, one_thread, run_facts_of, sizes
 from openant_agents.training import (
     Training,
@@ -168,19 +168,36 @@ def train_async(
     if source is not None:
         learned_by(source, env)  # refuses what does not suit, while nothing is begun
     with one_thread(), training_run(folder, facts, tensorboard) as (run, events, stop):
+        # All that may be wrong in the folder shows before a learner starts.
+        training = Training(env, run, steps, report, stop)
         checkpoint, rows = run.go_on(agent.replay.width)
+        _remember(training, agent, checkpoint, rows)
         learner = LearnerProcess(
             Job(folder, settings, observations, actions, seed, device, updates_per_step, source), agent
         )
         try:
-            acting = _Acting(Training(env, run, steps, report, stop), agent, settings, learner, events)
-            acting.remember(checkpoint, rows)
+            acting = _Acting(training, agent, settings, learner, events)
             with in_time_with(env):
                 acting.go(seed)
             learner.end(acting.state)
-            return acting.training.end(acting.learning, learner.updates)
+            return training.end(acting.learning, learner.updates)
         finally:
             learner.close()  # it saves what it has
+
+
+def _remember(training: Training, agent: Sac, checkpoint: Mapping[str, Any] | None, rows: NDArray[np.float32]) -> None:
+    """Go on behind every transition that was made."""
+    at = agent.replay.observations + agent.replay.actions
+    for reward, dt in rows[-20_000:, at : at + 2].tolist():  # more than a window holds
+        training.average.add(reward, dt)
+    training.seconds, training.step = float(rows[:, at + 1].sum(dtype=np.float64)), len(rows)
+    if checkpoint is not None:
+        with making_sense(training.run.folder):
+            agent.begin_with(checkpoint["agent"])  # refuses other networks; chance is the learner's
+            training.helped.update(checkpoint.get("helped", {}))
+    # Chance goes on elsewhere than it began, or every resumed stretch would explore alike.
+    agent.random = np.random.default_rng((agent.noise.initial_seed(), len(rows)))
+    agent.noise.manual_seed(agent.noise.initial_seed() + len(rows))
 
 
 class _Acting:
@@ -192,19 +209,6 @@ class _Acting:
         self.training, self._agent, self._settings, self._learner = training, agent, settings, learner
         self._events = events
         self._row = np.empty(agent.replay.width, np.float32)
-
-    def remember(self, checkpoint: Mapping[str, Any] | None, rows: NDArray[np.float32]) -> None:
-        """Go on behind every transition that was made."""
-        at = self._agent.replay.observations + self._agent.replay.actions
-        training = self.training
-        for reward, dt in rows[-20_000:, at : at + 2].tolist():  # more than a window holds
-            training.average.add(reward, dt)
-        training.seconds, training.step = float(rows[:, at + 1].sum(dtype=np.float64)), len(rows)
-        if checkpoint is not None:
-            training.helped.update(checkpoint.get("helped", {}))
-        # Chance goes on elsewhere than it began, or every resumed stretch would explore alike.
-        self._agent.random = np.random.default_rng((self._agent.noise.initial_seed(), len(rows)))
-        self._agent.noise.manual_seed(self._agent.noise.initial_seed() + len(rows))
 
     @property
     def state(self) -> dict[str, Any]:

@@ -167,6 +167,9 @@ class Training:
         stop: set once someone wants it to end.
         write: how something is written to the run's folder: at once, or by another thread.
 
+    Raises:
+        BadInput: the run's folder says of no place that the robot's circle is there.
+
     Attributes:
         step, seconds: environment steps so far, and how long they took, s.
         late: of a robot in real time, steps that began later than they should.
@@ -182,6 +185,7 @@ class Training:
         write: Callable[..., None] = _at_once,
     ) -> None:
         self.env, self.run, self.steps, self.stop = env, run, steps, stop
+        self._unplaced = place_circle(env, run.folder)
         self._report, self._write = report, write
         self.step, self.seconds, self.late = 0, 0.0, 0
         self.average = AverageReward()
@@ -197,10 +201,9 @@ class Training:
 
         A robot whose circle lies where it stood first keeps it there where its run goes on, wherever it stands then.
         """
-        env, unplaced = self.env.unwrapped, place_circle(self.env, self.run.folder)
         observation: Array | None = reset_or_stop(self.env, seed, self.stop)
-        if unplaced and env.origin is not None:
-            centre = {"origin_m": [stored(value) for value in env.origin]}
+        if self._unplaced and self.env.unwrapped.origin is not None:
+            centre = {"origin_m": [stored(value) for value in self.env.unwrapped.origin]}
             self._write(write_text, self.run.folder / CIRCLE, json_text(centre))
         return observation
 
@@ -333,8 +336,9 @@ def place_circle(env: gymnasium.Env[Any, Any], folder: Path) -> bool:
         return False
     if not path.is_file():
         return True
-    with reading(path, "this is no circle's centre", "delete it: the circle is where the robot stands then"):
-        x, y = map(float, read_json(path)["origin_m"])
+    remedy = "delete it: the circle is where the robot stands then"
+    with reading(path, "this is no circle's centre", remedy):
+        x, y = map(float, read_json(path, remedy)["origin_m"])
         if not math.isfinite(x + y):
             raise ValueError
     env.unwrapped.origin = x, y

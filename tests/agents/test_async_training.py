@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -189,6 +190,41 @@ def test_a_circle_stays_where_the_robot_stood_first_when_its_run_goes_on(tmp_pat
     (tmp_path / "a" / "circle.json").write_text('{"origin_m": [1]}')
     with pytest.raises(BadInput, match=r"circle.json.*no circle's centre.*delete it"):
         walked(tmp_path / "a", Placed(0.2), 15)
+
+
+def test_what_is_wrong_in_a_run_shows_in_one_line_before_a_learner_starts(tmp_path, monkeypatch):
+    class Unplaced(Robot):
+        """One whose circle nobody chose."""
+
+        origin = None
+
+    def refused(spoil, words):
+        run = shutil.copytree(tmp_path / "good", tmp_path / str(len(list(tmp_path.iterdir()))))
+        spoil(run)
+        with pytest.raises(BadInput, match=words) as caught:
+            train_async(Unplaced(), folder=run, steps=60, seed=0, settings=SMALL)
+        assert "\n" not in str(caught.value)
+
+    def damaged(**changes):
+        def spoil(run):
+            checkpoint = {**load_checkpoint(run), **changes}
+            torch.save({name: value for name, value in checkpoint.items() if value is not None}, run / "checkpoint.pt")
+
+        return spoil
+
+    train_async(Robot(), folder=tmp_path / "good", steps=40, seed=0, settings=SMALL)
+
+    def started(*arguments):
+        raise AssertionError("a learner was started")
+
+    monkeypatch.setattr(async_training, "LearnerProcess", started)
+    refused(lambda run: (run / "circle.json").write_text("{"), "circle.json.*delete it")
+    refused(lambda run: (run / "circle.json").write_text('{"origin_m": ["x", 1]}'), "no circle's centre.*delete it")
+    refused(lambda run: (run / "checkpoint.pt").write_bytes(b"x"), "damaged or none of ours")
+    refused(damaged(agent={}), "of an agent with other networks")
+    refused(damaged(agent=None), "not as its run.json and this program have it")
+    refused(damaged(helped=3), "run.json and this program have it")
+    refused(lambda run: os.truncate(run / "transitions.f32", 8), "bytes of the .* that its checkpoint speaks of")
 
 
 def rows_so_far(folder: Path) -> np.ndarray:
