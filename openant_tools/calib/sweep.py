@@ -25,7 +25,6 @@ from openant_tools.calib.wires import heard
 from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.guards import Guards
-from openant_tools.comms.lateness import losses
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.procedure.step import Live, Progress, Subroutine
 from openant_tools.recording.run import Facts, Run
@@ -64,7 +63,7 @@ class JointSweep:
     Attributes:
         friction_nm: f of the module's formula, with its standard error.
         weight_nm: g. low_stop_rad, high_stop_rad: where it was held.
-        lost: share of reads that brought no valid answer while this computer was punctual. temperature_c: at the end. volts: lowest.
+        temperature_c: at the end. volts: lowest.
         followed: share of the way between its limits in which it moved as it was told; without it nothing was measured.
     """
 
@@ -75,7 +74,6 @@ class JointSweep:
     weight_error_nm: float | None
     low_stop_rad: float | None
     high_stop_rad: float | None
-    lost: float
     temperature_c: float | None
     volts: float | None
     followed: float = 1.0
@@ -86,7 +84,8 @@ class JointSweep:
 
 def joint_sweep_of(content: Mapping[str, Any]) -> JointSweep:
     """The inverse of `as_dict`; raises TypeError on what it did not write."""
-    return JointSweep(**content)
+    # Which answers were lost stood there until `lost_answers` told it better.
+    return JointSweep(**{name: value for name, value in content.items() if name != "lost"})
 
 
 def commands(limits: Mapping[str, tuple[float, float]], joints: tuple[str, ...], rate_hz: float) -> Array:
@@ -180,11 +179,10 @@ def analyse(run: Run, limits: Mapping[str, tuple[float, float]]) -> dict[str, Jo
     Args:
         run: a recording of `sweep`, with cmd, pos, pwm. limits: joint → the limits that the sweep was made with, rad.
     """
-    lost = losses(run).shares
-    return {joint: _joint(run, joint, *limits[joint], lost[joint]) for joint in run.joints}
+    return {joint: _joint(run, joint, *limits[joint]) for joint in run.joints}
 
 
-def _joint(run: Run, joint: str, low: float, high: float, lost: float) -> JointSweep:
+def _joint(run: Run, joint: str, low: float, high: float) -> JointSweep:
     cmd, pos, duty = (run.signal(name, [joint])[:, 0] for name in ("cmd", "pos", "pwm"))
     volt, temperature = (run.signal(name, [joint])[:, 0] for name in ("volt", "temp"))
     model = servo_model(run.facts.motors[joint])
@@ -205,7 +203,6 @@ def _joint(run: Run, joint: str, low: float, high: float, lost: float) -> JointS
     return JointSweep(
         joint, friction, friction_error, weight, weight_error,
         _stop(cmd, pos, -1), _stop(cmd, pos, 1),
-        lost,
         float(np.nanmax(temperature[-200:])) if np.isfinite(temperature[-200:]).any() else None,
         float(np.nanmin(volt)) if np.isfinite(volt).any() else None,
         followed,

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.usefixtures("half_rate")
 HEALTHY = {
     joint: JointSweep(
         joint, 0.04, 0.002, 0.025 if joint.startswith("knee") else 0.0, 0.004, -0.787 if "hip" in joint else -1.223,
-        0.787 if "hip" in joint else 1.223, 0.0, 27.0, 11.9,
+        0.787 if "hip" in joint else 1.223, 27.0, 11.9,
     )
     for joint in JOINT_NAMES
 }  # fmt: skip
@@ -191,7 +191,7 @@ def test_a_servo_that_does_not_answer_is_named_before_anything_moves(known_folde
 @pytest.fixture
 def known_folder(tmp_path):
     folder = create_robot(tmp_path / "ant")
-    swept = {joint: one.as_dict() for joint, one in HEALTHY.items()}
+    swept = {joint: one.as_dict() | {"lost": 0.0} for joint, one in HEALTHY.items()}  # as it was once written
     keep(Finding("bounds", True, "", (), "", "", data={"sweep": swept}), folder)
     return folder.path
 
