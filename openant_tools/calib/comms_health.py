@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from openant_tools.calib.lost_answers import loose, lost_alone
+from openant_tools.calib.lost_answers import loose, lost_alone, most_lost
 from openant_tools.calib.wires import opened_bus, robot_servos, wait
 from openant_tools.comms.bench import measure_gap, measure_rate
 from openant_tools.comms.faults import Cause
@@ -24,7 +24,6 @@ COMMAND = "openant calib comms"
 CYCLES, RATE_HZ = 500, 100.0
 #: s of writing and reading as fast as it goes
 FAST_S = 2.0
-LOST_SHARE = 0.002
 #: Of what the wire would allow; less is an adapter that holds answers back.
 RATE_SHARE = 0.35
 
@@ -56,6 +55,7 @@ def comms_health(bench: Bench) -> Procedure:
             wait(bus.clock, 1 / RATE_HZ)
         rows = np.reshape(np.array(punctual, bool), (-1, len(servos.ids)))
         lost = dict(zip(servos.joints, rows.sum(axis=0).tolist(), strict=True))
+        asked = CYCLES * len(lost)
         host = bus.clock.lateness.words or "answers came late"
         yield Progress(0.5, "as fast as it goes")
         rate = measure_rate(bus, servos.ids, FAST_S)
@@ -63,12 +63,12 @@ def comms_health(bench: Bench) -> Procedure:
         trials, gap = measure_gap(bus, servos.ids)
         busy = bus.clock.lateness.busy
     if missed:
-        words = f"{host}: {missed} of {CYCLES * len(lost)} answers were missed by that, and say nothing of servos and cables"
+        words = f"{host}: {missed} of {asked} answers were missed by that, and say nothing of servos and cables"
         yield Say(f"{words} → {REMEDY}", "warn")
         if len(rows) < CYCLES * ENOUGH:
             problems.append(f"cannot judge the cables, because {words} → {REMEDY}")
     if len(rows) >= CYCLES * ENOUGH:
-        problems += loose(lost_alone(servos.joints, rows), config.bus.chain, least=LOST_SHARE, moving=False)
+        problems += loose(lost_alone(servos.joints, rows), config.bus.chain, moving=False)
     if rate.hz < RATE_SHARE * rate.limit_hz and busy:
         problems.append(f"cannot judge the rate, because {host} → {REMEDY}")
     elif rate.hz < RATE_SHARE * rate.limit_hz:
@@ -86,14 +86,14 @@ def comms_health(bench: Bench) -> Procedure:
     return Finding(
         "comms",
         not problems,
-        f"{sum(lost.values())} of {CYCLES * len(lost)} answers lost at {exact(RATE_HZ)} Hz; {rate.words}",
+        f"{sum(lost.values())} of {asked} answers lost at {exact(RATE_HZ)} Hz; {rate.words}",
         (
             Evidence(
                 "answers lost",
-                sum(lost.values()) / (CYCLES * len(lost)),
+                sum(lost.values()) / asked,
                 "share",
                 f"{CYCLES} reads at {exact(RATE_HZ)} Hz",
-                most=LOST_SHARE,
+                most=most_lost(asked) / asked,
             ),
             *(
                 [

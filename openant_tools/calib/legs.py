@@ -8,6 +8,7 @@ import numpy as np
 
 from openant_tools.calib.bounds import Unwrapped
 from openant_tools.calib.ids import nudge
+from openant_tools.calib.lost_answers import most_lost
 from openant_tools.calib.wires import BOOT_S, differs, in_joints, opened_bus, robot_servos, servo_angles, wait
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.faults import Cause
@@ -26,8 +27,8 @@ __all__ = ["legs"]
 
 COMMAND = "openant calib legs"
 #: Reads while the builder moves the leg and wiggles its cables: so long once the range was seen, and the longest that hands
-#: are waited for. More than this share lost is a bad contact.
-READ_S, LONGEST_S, LOST_SHARE = 3.0, 60.0, 0.005
+#: are waited for.
+READ_S, LONGEST_S = 3.0, 60.0
 #: Share of the kit's range that a hand must reach at a leg that is not in its shell yet.
 RANGE_SHARE = 0.6
 NUDGE_RAD, NUDGED_RAD = 0.1, 0.04
@@ -167,16 +168,16 @@ def _by_hand(bus: Bus, joints: list[str], config: RobotConfig) -> Subroutine[tup
         late = bus.clock.lateness.words
         if late:
             yield Say(f"{late}: what was lost meanwhile says nothing of cables → {REMEDY}", "warn")
-        if lost > LOST_SHARE * asked:
+        if lost > most_lost(asked):
             raise HardwareFault(
                 f"{lost} of {asked} answers were lost while {joint} moved",
                 remedy=f"look at the cable before {joint} and at its plugs: press each in to the click",
             )
         seen = float(np.ptp(tracks[joint][1])) if tracks[joint][1] else 0.0
         evidence.append(Evidence(f"range of {joint}", seen, "rad", "by hand", least=RANGE_SHARE * whole))
-        share = lost / asked if asked else None
+        share, most = (lost / asked, most_lost(asked) / asked) if asked else (None, None)
         evidence.append(
-            Evidence(f"answers lost at {joint}", share, "share", f"{asked} reads while it moved", most=LOST_SHARE)
+            Evidence(f"answers lost at {joint}", share, "share", f"{asked} reads while it moved", most=most)
         )
         if seen < RANGE_SHARE * whole:
             raise HardwareFault(

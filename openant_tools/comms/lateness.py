@@ -149,11 +149,9 @@ class Losses:
     judged: bool
 
     @property
-    def shares(self) -> dict[str, float]:
-        """Joint → share of its answers lost; 0 where nothing can be concluded."""
-        if not self.judged:
-            return dict.fromkeys(self.joints, 0.0)
-        return dict(zip(self.joints, self.lost[self.rows].mean(axis=0).tolist(), strict=True))
+    def counted(self) -> NDArray[np.bool_]:
+        """(reads, joints) what was lost in the rows that count; of no reads where nothing can be concluded."""
+        return self.lost[self.rows] if self.judged else self.lost[:0]
 
 
 def losses(run: Run) -> Losses:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from builder import Robot, robot
+from scipy.stats import binom
 
 from openant_tools.bringup import check as check_step
 from openant_tools.bringup.check import changed, check, unjudged
-from openant_tools.calib.lost_answers import loose
+from openant_tools.calib import lost_answers
+from openant_tools.calib.lost_answers import LostAlone, loose, lost_alone, most_lost
 from openant_tools.calib.sweep import JointSweep, analyse, joint_sweep_of, sweep
 from openant_tools.calib.wires import engine_config
 from openant_tools.errors import BadInput
@@ -34,8 +37,14 @@ def now(joint: str, **different: object) -> list[str]:
     return changed(HEALTHY, {**HEALTHY, joint: replace(HEALTHY[joint], **different)})
 
 
+def lost(**shares: float) -> LostAlone:
+    """Shares of the answers in the reads of a slow sweep."""
+    shares = dict.fromkeys(JOINT_NAMES, 0.0) | shares
+    return LostAlone({joint: round(2500 * share) for joint, share in shares.items()}, 2500)
+
+
 def test_nothing_changed_is_nothing_said():
-    assert changed(HEALTHY, HEALTHY) == [] == loose(dict.fromkeys(JOINT_NAMES, 0.0), ())
+    assert changed(HEALTHY, HEALTHY) == [] == loose(lost(), ())
 
 
 def test_doubled_friction_names_the_joint_and_its_gear():
@@ -69,7 +78,7 @@ def test_a_horn_on_another_spline_moves_both_stops_out_of_reach():
 
 
 @pytest.mark.parametrize(
-    ("lost", "chain", "where"),
+    ("shares", "chain", "where"),
     [
         ({"knee_fl": 0.02}, (), "knee_fl: 2.0 % of its answers were lost while it moved → a loose connector between hip_fl and knee_fl"),
         ({"hip_fl": 0.02, "knee_fl": 0.02}, (), "a loose connector from the board to hip_fl"),
@@ -77,21 +86,55 @@ def test_a_horn_on_another_spline_moves_both_stops_out_of_reach():
         (dict.fromkeys(JOINT_NAMES, 0.02), (), "8 of 8 servos lose answers while they move → the power plug"),
     ],
 )  # fmt: skip
-def test_a_loose_connector_is_named_by_how_the_cables_run(lost, chain, where):
-    (words,) = loose(dict.fromkeys(JOINT_NAMES, 0.0) | lost, chain)
+def test_a_loose_connector_is_named_by_how_the_cables_run(shares, chain, where):
+    (words,) = loose(lost(**shares), chain)
     assert where in words
 
 
 def test_what_all_lose_alike_blames_no_joint_and_names_who_loses_far_more():
     alike = {joint: 0.02 + 0.001 * k for k, joint in enumerate(JOINT_NAMES)}
-    (words,) = loose(alike, ())
+    (words,) = loose(lost(**alike), ())
     assert not words.startswith("hip")
     for shared in ("power plug", "supply", "adapter", "busy computer"):
         assert shared in words
-    both = loose(alike | {"knee_fl": 0.2}, ())
+    both = loose(lost(**alike | {"knee_fl": 0.2}), ())
     assert both[0] == words
     assert [line.partition(":")[0] for line in both[1:]] == ["knee_fl"]
-    assert loose(alike, (), both) == []
+    assert loose(lost(**alike), (), both) == []
+
+
+def named(rows: np.ndarray) -> list[str]:
+    """What begins each line on these lost answers, (reads, joints)."""
+    return [line.partition(":")[0] for line in loose(lost_alone(JOINT_NAMES, rows), ())]
+
+
+def drawn(seed: int, reads: int = 2500, **shares: float) -> np.ndarray:
+    """Answers lost by chance, each servo's apart; those of `all` together."""
+    chance = np.random.default_rng(seed)
+    rates = [shares.get(joint, shares.get("each", 0.0)) for joint in JOINT_NAMES]
+    return (chance.random((reads, len(JOINT_NAMES))) < rates) | (chance.random((reads, 1)) < shares.get("all", 0.0))
+
+
+def test_of_sound_robots_one_in_a_thousand_is_blamed_at_most():
+    for reads in (100, 500, 2500, 10_000):
+        kept = binom.cdf(most_lost(reads, 8), reads, lost_answers.SOUND_SHARE)
+        assert 1 - kept**8 <= lost_answers.SIGNIFICANCE
+        assert binom.cdf(most_lost(reads, 8) - 1, reads, lost_answers.SOUND_SHARE) ** 8 < 1 - lost_answers.SIGNIFICANCE
+    for alike in (0.01, 0.05, 0.2):  # and where all lose alike, a connector beside that
+        assert sum(len(named(drawn(seed, all=alike, each=alike))) > 1 for seed in range(500)) <= 1
+
+
+@pytest.mark.parametrize("sound_share", [0.0002, 0.0005, 0.001, 0.002, 0.003])
+@pytest.mark.parametrize("significance", [1e-4, 1e-3, 1e-2])
+def test_a_verdict_does_not_hang_on_the_figures_that_are_chosen(monkeypatch, sound_share, significance):
+    monkeypatch.setattr(lost_answers, "SOUND_SHARE", sound_share)
+    monkeypatch.setattr(lost_answers, "SIGNIFICANCE", significance)
+    for seed in range(20):
+        assert named(drawn(seed, each=1e-5)) == []
+        assert named(drawn(seed, each=1e-5, knee_fl=0.02)) == ["knee_fl"]
+        assert len(named(drawn(seed, all=0.02))) == 1
+        (words, *joints) = named(drawn(seed, all=0.02, hip_rl=0.1))
+        assert (words.startswith("8 of 8 servos"), joints) == (True, ["hip_rl"])
 
 
 def test_without_a_baseline_it_says_how_to_get_one(tmp_path):
