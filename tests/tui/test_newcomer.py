@@ -29,6 +29,7 @@ from openant_tools.tui.faults import condition
 from openant_tools.tui.feeds import History
 from openant_tools.tui.joint_table import JointTable
 from openant_tools.tui.process import Process
+from openant_tools.tui.screens.recordings import RecordingsScreen
 from openant_tools.tui.screens.step import StepScreen
 from openant_tools.tui.screens.walk import WalkScreen
 from openant_tools.tui.step_help import step_doc
@@ -307,6 +308,17 @@ def test_what_was_done_on_a_virtual_robot_counts_while_one_is_in_use(robot: Robo
         await pilot.pause()
         assert "Continue my-ant · 2 of 15" in screen_text(app)
         assert "3 Motor IDs             ✓ ok" in screen_text(app)
+
+    with_program(robot.path, look)
+
+
+def test_the_walk_offers_replay_by_the_key_that_opens_what_can_be_replayed(robot: RobotFolder) -> None:  # noqa: F811
+    async def look(app: OpenAnt, pilot: Pilot[int]) -> None:
+        keys = screen_text(app).splitlines()[-1]
+        assert "r Replay" in keys
+        assert "All" in keys, "there is room for all of them"
+        await pilot.press("r")
+        await until(pilot, lambda: isinstance(app.screen, RecordingsScreen))
 
     with_program(robot.path, look)
 

@@ -89,7 +89,7 @@ class WalkScreen(Page):
         Binding("b", "app.bench", "Bench", show=False),
         Binding("u", "app.step('undo')", "Undo", show=False),
         Binding("f", "app.go('findings')", "Findings"),
-        Binding("r", "app.go('recordings')", "Play"),
+        Binding("r", "app.go('recordings')", "Replay"),
         Binding("g", "app.go('gap')", "Gap"),
         Binding("t", "app.go('learn')", "Learn"),
         Binding("s", "app.go('settings')", "Setup"),
