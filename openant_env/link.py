@@ -92,7 +92,7 @@ def engine_config(
             )
     more: dict[str, Any] = {**seen, "rate_hz": rate_hz}
     if folder is not None:
-        more |= {"journal": str(folder.journal), "passport": passport_registers(folder)}
+        more |= {"journal": str(folder.journal), "passport": passport_registers(folder, real=control is None)}
     if robot is None:
         assert bus is not None  # of a virtual robot
         return config_of_unknown_robot(bus, control, **more)

@@ -81,7 +81,7 @@ def check(bench: Bench) -> Procedure:
         BadInput: there is nothing to compare with: the step Observation bounds was not done.
     """
     config = bench.folder.config()
-    bounds = latest(bench.folder, "bounds")
+    bounds = latest(bench.folder, "bounds", real=not bench.virtual)
     if bounds is None or "sweep" not in bounds.data:
         raise BadInput(
             "there is nothing to compare with yet",
@@ -103,7 +103,9 @@ def check(bench: Bench) -> Procedure:
     # Before hardware is blamed: registers that other software left explain most of what a sweep can show.
     odd = [
         one
-        for one in differences_of_robot(robot_servos(config), state, config, passport_registers(bench.folder))
+        for one in differences_of_robot(
+            robot_servos(config), state, config, passport_registers(bench.folder, real=not bench.virtual)
+        )
         if one.register != "pwm_limit"  # set to robot.toml's by whatever moves
     ]
     problems += [f"{one.joint}: {one.reads} → {one.mended}" for one in odd if one.stops or one.by != BY_FACTORY]
@@ -406,7 +408,7 @@ def _against_model(
     bench: Bench, run: Run, evidence: list[Evidence], unsure: list[str], known: Collection[str]
 ) -> Subroutine[list[str]]:
     """Joints that the calibrated model simulates much worse than when it was made, besides those named already."""
-    gap = latest(bench.folder, "gap")
+    gap = latest(bench.folder, "gap", real=not bench.virtual)
     if gap is None or "by_joint_rad" not in gap.data:
         yield Say("there is no gap check to compare the twitch with", "warn")
         return []

@@ -29,7 +29,7 @@ def gap_check(bench: Bench) -> Procedure:
     Raises:
         BadInput: nothing was identified yet.
     """
-    identified = latest(bench.folder, "identify")
+    identified = latest(bench.folder, "identify", real=not bench.virtual)
     if identified is None:
         raise BadInput("nothing was identified yet", remedy="do the step Identification first")
     runs = [read_run(bench.folder.path / name) for name in identified.data["held_out"]]

@@ -174,7 +174,7 @@ def _still_accepted(
     bench: Bench, state: Mapping[str, Mapping[str, int]], present: Sequence[Servo], config: RobotConfig
 ) -> Subroutine[Mapping[str, Mapping[str, int]]]:
     """The passport's registers; without those that were accepted once and are no longer meant."""
-    passport = passport_registers(bench.folder)
+    passport = passport_registers(bench.folder, real=not bench.virtual)
     plain, kept = (
         differences_of_robot(present, state, config, {}),
         differences_of_robot(present, state, config, passport),

@@ -133,7 +133,7 @@ def _servo(motor: MotorSection) -> Servo:
 def engine_config(bench: Bench, **more: object) -> EngineConfig:
     """The engine's config for this robot, its IMU beside the bus where it is known."""
     config = bench.folder.config()
-    passport = passport_registers(bench.folder)
+    passport = passport_registers(bench.folder, real=not bench.virtual)
     more = {"imu": imu_of_robot(config, bench.imu), "journal": str(bench.folder.journal), "passport": passport, **more}
     return config_of_robot(config, bench.bus, control=bench.control, **more)
 

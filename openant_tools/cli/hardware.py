@@ -111,7 +111,9 @@ def engine_config(
         if described is not None:
             assert folder is not None
             more.setdefault("journal", str(folder.journal))
-            yield config_of_robot(described, port, control=control, passport=passport_registers(folder), **more)
+            yield config_of_robot(
+                described, port, control=control, passport=passport_registers(folder, real=control is None), **more
+            )
         else:
             yield config_of_unknown_robot(find_bus(port), control, **more)
 

@@ -439,9 +439,13 @@ def refusal(found: Sequence[Difference]) -> tuple[str, str]:
     )
 
 
-def passport_registers(folder: RobotFolder | None) -> dict[str, dict[str, int]]:
-    """joint → register → counts as the robot's passport has them: as they stood after its last inventory."""
-    inventory = None if folder is None else latest(folder, "inventory")
+def passport_registers(folder: RobotFolder | None, *, real: bool) -> dict[str, dict[str, int]]:
+    """joint → register → counts as the robot's passport has them: as they stood after its last inventory.
+
+    Args:
+        real: whether it is the real robot, of which a virtual one's inventory says nothing.
+    """
+    inventory = None if folder is None else latest(folder, "inventory", real=real)
     kept = {} if inventory is None else inventory.data.get("registers", {})
     if not isinstance(kept, Mapping):
         return {}

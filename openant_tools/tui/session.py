@@ -210,7 +210,7 @@ class Session:
                 "imu": imu_of_robot(robot, imu),
                 "journal": journal,
                 "still": True,
-                "passport": passport_registers(folder),
+                "passport": passport_registers(folder, real=self.virtual is None),
             }
             config = config_of_robot(robot, port, control=control, **more)
         return config

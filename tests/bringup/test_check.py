@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builder import Robot, robot
+from builder import Robot, finished, robot
 from scipy.stats import binom
 
 from openant_tools.bringup import check as check_step
@@ -18,7 +18,7 @@ from openant_tools.calib.sweep import JointSweep, analyse, joint_sweep_of, sweep
 from openant_tools.calib.wires import engine_config
 from openant_tools.errors import BadInput
 from openant_tools.procedure.finding import Finding, keep
-from openant_tools.procedure.step import Event, Progress
+from openant_tools.procedure.step import Bench, Event, Progress
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 
@@ -140,6 +140,18 @@ def test_a_verdict_does_not_hang_on_the_figures_that_are_chosen(monkeypatch, sou
 def test_without_a_baseline_it_says_how_to_get_one(tmp_path):
     with robot(tmp_path / "ant") as ant, pytest.raises(BadInput, match="there is nothing to compare with yet"):
         ant.do(check(ant.bench))
+
+
+def test_a_real_robot_is_compared_with_nothing_that_a_virtual_one_had(tmp_path):
+    folder = create_robot(tmp_path / "ant")
+    swept = {joint: one.as_dict() for joint, one in HEALTHY.items()}
+    keep(Finding("bounds", True, "", (), "", "", data={"sweep": swept}), folder, virtual=True)
+    registers = {"hip_rr": {"position_p_gain": 400}}
+    keep(Finding("inventory", True, "", (), "", "", data={"registers": registers}), folder, virtual=True)
+    with pytest.raises(BadInput, match="there is nothing to compare with yet"):
+        finished(check(Bench(folder)))
+    real, virtual = (engine_config(Bench(folder, "/dev/null", control=control)) for control in (None, "a socket"))
+    assert (real.passport, virtual.passport) == ({}, registers)
 
 
 def keep_baseline(ant: Robot) -> None:

@@ -308,6 +308,8 @@ def test_what_was_done_on_a_virtual_robot_counts_while_one_is_in_use(robot: Robo
         await pilot.pause()
         assert "Continue my-ant · 2 of 15" in screen_text(app)
         assert "3 Motor IDs             ✓ ok" in screen_text(app)
+        app.action_go("findings")
+        await until(pilot, lambda: says(app, "UTC, ids, on a virtual robot"))
 
     with_program(robot.path, look)
 

@@ -110,7 +110,8 @@ kept in the robot's `findings/`, one a run of a step. The passport is the page t
 def _page(finding: Finding, width: int) -> Text:
     head = Text(f"{_title(finding.step)}\n", style="bold")
     text = Text("\n").join([head, *finding_lines(finding, width)])
-    return text.append(f"\n\n{finding.date:%Y-%m-%d %H:%M} UTC, {finding.command}")
+    where = ", on a virtual robot" if finding.virtual else ""
+    return text.append(f"\n\n{finding.date:%Y-%m-%d %H:%M} UTC, {finding.command}{where}")
 
 
 def _title(step: str) -> str:
