@@ -98,7 +98,7 @@ class TagSetup:
     Attributes:
         origin_size, body_size: edge length in m (`tag_family` says which square that is).
         body_position: centre of the body tag in the body, m. body_yaw: its up-direction against the body's x, rad.
-        min_margin, max_hamming: what the detector must be sure of; upstream accepts a margin of 2.
+        min_margin: what the detector must be sure of; upstream accepts 2.
         heights: of the body's origin over the floor, m, between which it can be.
         edge: share of the picture's width and height, on each side, that counts as its edge.
         decimate: quads are searched in a picture this much smaller, corners refined in the whole one. At 2 the families
@@ -113,7 +113,6 @@ class TagSetup:
     body_position: tuple[float, float, float] = (0.0, 0.0, 0.085)
     body_yaw: float = 0.0
     min_margin: float = 5.0
-    max_hamming: int = 0
     heights: tuple[float, float] = (-0.05, 0.45)
     edge: float = 0.10
     decimate: float = 1.5
@@ -134,7 +133,12 @@ class TagSetup:
 
 @dataclass(frozen=True)
 class Sighting:
-    """A tag in a picture: corners (4, 2) in OpenCV's pixels, top left first, then clockwise as the tag is read."""
+    """A tag in a picture: corners (4, 2) in OpenCV's pixels, top left first, then clockwise as the tag is read.
+
+    The detector names the nearest code that is up to two wrong bits away (`hamming`), which of `tag16h5`, whose codes differ
+    by five, may be another tag's. Here a tag with any wrong bit has no place: for one to be taken for another, as many cells
+    as the family's codes differ by must be misread at once, seven of 21 of `tagCircle21h7`, and each the right way.
+    """
 
     id: int
     corners: Array
@@ -369,7 +373,9 @@ class BodyTracker:
         doubtful = [s for s in sightings if s.id == tag]
         if doubtful:
             s = max(doubtful, key=lambda s: s.margin)
-            how = f"margin {number(s.margin, decimals=1)}, {s.hamming} wrong bits"
+            if s.hamming and s.margin >= self.setup.min_margin:
+                return f"body tag {tag} is doubtful (wrong bits: {s.hamming}): a spot, a crease or a shadow on it"
+            how = f"margin {number(s.margin, decimals=1)}, wrong bits: {s.hamming}"
             return f"body tag {tag} is doubtful ({how}): too small, too dark or blurred"
         others = sorted({s.id for s in sightings if s.margin >= self.setup.min_margin and s.hamming == 0})
         others = [i for i in others if i != self.setup.origin_id]
@@ -526,20 +532,22 @@ class BodyTracker:
 
 def best(sightings: list[Sighting], tag: int, setup: TagSetup) -> Sighting | None:
     """The surest sighting of a tag that passes the gates."""
-    good = [s for s in sightings if s.id == tag and s.margin >= setup.min_margin and s.hamming <= setup.max_hamming]
-    return max(good, key=lambda s: s.margin, default=None)
+    return max(_sure(sightings, tag, setup), key=lambda s: s.margin, default=None)
+
+
+def _sure(sightings: list[Sighting], tag: int, setup: TagSetup) -> list[Sighting]:
+    return [s for s in sightings if s.id == tag and s.margin >= setup.min_margin and s.hamming == 0]
 
 
 def _twins(sightings: list[Sighting], tag: int, setup: TagSetup) -> bool:
     """Whether a picture shows two sheets with one number."""
-    good = [s for s in sightings if s.id == tag and s.margin >= setup.min_margin and s.hamming <= setup.max_hamming]
-    surest = max(good, key=lambda s: s.margin, default=None)
+    surest = best(sightings, tag, setup)
     return surest is not None and any(
         s is not surest
         and s.margin > TWIN_SHARE * surest.margin
         and TWIN_SHARE < s.size_px / surest.size_px < 1 / TWIN_SHARE
         and float(np.linalg.norm(s.corners.mean(axis=0) - surest.corners.mean(axis=0))) > surest.size_px / 2
-        for s in good
+        for s in _sure(sightings, tag, setup)
     )
 
 

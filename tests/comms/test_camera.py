@@ -25,7 +25,7 @@ from openant_tools.comms.clock import RealClock
 from openant_tools.comms.intrinsics import CharucoBoard, Intrinsics, calibrate
 from openant_tools.comms.latency import camera_latency
 from openant_tools.comms.setup import camera_of_robot
-from openant_tools.comms.tag_family import FAMILIES, load_family
+from openant_tools.comms.tag_family import FAMILIES, TagFamily, load_family
 from openant_tools.comms.tags import BodyLost, BodyPose, BodyTracker, TagDetector, TagSetup
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.robot.config import parse_config
@@ -76,6 +76,55 @@ def test_bitmaps_are_what_the_detector_reads(family: str) -> None:
         low = 12 * (2 + (kind.cells - kind.edge_cells) // 2) - 0.5
         high = low + 12 * kind.edge_cells
         assert np.allclose(seen.corners, [[low, low], [high, low], [high, high], [low, high]], atol=0.6)
+
+
+@pytest.mark.parametrize("family", FAMILIES[:4])
+def test_no_tag_is_another_ones_until_as_many_cells_are_wrong_as_the_family_says(family: str) -> None:
+    kind = load_family(family)
+    corner = (kind.cells - kind.edge_cells) // 2
+    columns, rows = corner + np.array(kind.bits).T
+    turned = [[np.rot90(kind.bitmap(tag), k)[rows, columns] > 0 for tag in range(len(kind.codes))] for k in range(4)]
+    upright = np.array(turned[0], float)
+    for k, other in enumerate(np.array(turned, float)):
+        apart = upright @ (1 - other).T + (1 - upright) @ other.T
+        if k == 0:
+            np.fill_diagonal(apart, np.inf)
+        assert apart.min() >= kind.hamming
+
+
+def test_a_tag_with_a_wrong_bit_is_neither_followed_nor_taken_for_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    family, printed, chance = (
+        "tag16h5",
+        TagFamily.bitmap,
+        np.random.default_rng(0),
+    )  # its codes differ by the fewest bits
+
+    def spotted(wrong: int) -> OverheadCamera:
+        def bitmap(kind: TagFamily, tag: int) -> np.ndarray:
+            cells = printed(kind, tag)
+            if tag == 12:
+                corner = (kind.cells - kind.edge_cells) // 2
+                for x, y in chance.permutation(kind.bits)[:wrong]:
+                    cells[corner + y, corner + x] ^= 255
+            return cells
+
+        with monkeypatch.context() as patch:
+            patch.setattr(TagFamily, "bitmap", bitmap)
+            return OverheadCamera(
+                replace(SMALL, origin=replace(MIDDLE, family=family), body=TagOnRobot(family, 12)), seed=3
+            )
+
+    for wrong, words in ((1, "wrong bits: 1"), (2, "wrong bits: 2"), (3, ""), (4, "")):
+        for _ in range(5):
+            camera = spotted(wrong)
+            # Whoever wears the tag that it reads like is not seen in its place, either.
+            trackers = [BodyTracker(TagSetup(family, body_id=tag), camera.intrinsics) for tag in (12, 3, 13)]
+            for tracker in trackers:
+                settle(tracker, camera)
+            first, *others = [tracker.track(photo(camera, scene(), 9), 0.3) for tracker in trackers]
+            assert isinstance(first, BodyLost)
+            assert words in first.reason
+            assert all(isinstance(one, BodyLost) for one in others)
 
 
 @pytest.mark.parametrize("family", ["tagCircle21h7", "tag36h11", "tag16h5", "tag25h9"])
