@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from openant_agents.compiled import compiled
 from openant_tools.errors import BadInput
-from openant_tools.numbers import typed
+from openant_tools.numbers import literal
 
 __all__ = ["TileCoder"]
 
@@ -65,7 +65,7 @@ class TileCoder:
         if len(narrow):
             at = narrow[0]
             raise BadInput(
-                f"the bounds of observation {at} leave no room for tiles: {typed(self.low[at])} to {typed(self.high[at])}",
+                f"the bounds of observation {at} leave no room for tiles: {literal(self.low[at])} to {literal(self.high[at])}",
                 remedy="measure the bounds while the robot moves all its joints",
             )
         if not 1 <= tiles <= MOST_TILES:

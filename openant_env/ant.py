@@ -28,7 +28,7 @@ from openant_tools.effects.acting import Acting
 from openant_tools.effects.commands import CommandPath
 from openant_tools.errors import BadInput
 from openant_tools.model.rollout import fill_setpoints
-from openant_tools.numbers import exact, typed
+from openant_tools.numbers import exact, literal
 from openant_tools.robot.folder import RobotFolder
 
 __all__ = ["Ant"]
@@ -446,7 +446,7 @@ def _whole_steps(dt: float, timestep: float, where: Path) -> int:
         raise BadInput(
             f"dt = {exact(dt, 's')} is no whole number of the model's timestep of {exact(timestep, 's')}",
             where=where,
-            remedy=f"use dt = {typed(below)} or {typed(below + timestep)}",
+            remedy=f"use dt = {literal(below)} or {literal(below + timestep)}",
         )
     return steps
 

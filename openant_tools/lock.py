@@ -25,7 +25,7 @@ from typing import IO
 
 from openant_tools.errors import BadInput
 
-__all__ = ["Claim", "Holder", "held", "holder", "typed", "wait_for"]
+__all__ = ["Claim", "Holder", "command_line", "held", "holder", "wait_for"]
 
 #: s for which a claim is tried again: whoever only asks who holds a lock holds it for a moment, too
 PATIENCE_S = 0.5
@@ -220,10 +220,10 @@ def _named(file: IO[bytes]) -> Holder:
 def _own_command() -> str:
     """This process as its user typed it, to the first option."""
     program = Path(sys.argv[0] if sys.argv else "").name
-    return typed("openant" if program in ("openant", "__main__.py") else program or "python", sys.argv[1:])
+    return command_line("openant" if program in ("openant", "__main__.py") else program or "python", sys.argv[1:])
 
 
-def typed(program: str, given: Sequence[str]) -> str:
+def command_line(program: str, given: Sequence[str]) -> str:
     """A program with the words that it was given, to the first option: three at most."""
     words = itertools.takewhile(lambda word: not word.startswith("-"), given[:3])
     return shlex.join([program, *words])

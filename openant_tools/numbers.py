@@ -18,12 +18,12 @@ __all__ = [
     "decimals_of",
     "exact",
     "is_error",
+    "literal",
     "number",
     "percent",
     "readable",
     "span",
     "stored",
-    "typed",
 ]
 
 UNKNOWN = "unknown"
@@ -128,7 +128,7 @@ def column(values: Sequence[float | None], unit: str = "", *, name: str = "") ->
 
 def exact(value: float, unit: str = "") -> str:
     """A number that somebody chose, which has the digits that he gave it: `0.5 s`."""
-    return typed(value).replace("-", "−") + _joined(unit)
+    return literal(value).replace("-", "−") + _joined(unit)
 
 
 def chosen(value: float, unit: str = "", *, name: str = "") -> str:
@@ -138,7 +138,7 @@ def chosen(value: float, unit: str = "", *, name: str = "") -> str:
     return (text.rstrip("0").rstrip(".") if "." in text else text) + _joined(unit)
 
 
-def typed(value: float, digits: int = 6) -> str:
+def literal(value: float, digits: int = 6) -> str:
     """A number as one types it into a file or a command, `-0.785398`: in the unit of the file, by these digits at most."""
     return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else f"{value:.{digits}g}"
 

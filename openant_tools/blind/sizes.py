@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from openant_tools.numbers import typed
+from openant_tools.numbers import literal
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import PLATFORM_PWM_LIMIT, Kit, kit
 
@@ -56,7 +56,7 @@ def _even(ranges: Ranges, size: int, chance: np.random.Generator) -> float:
 
 
 def _range(ends: tuple[float, float]) -> str:
-    return "…".join(map(typed, ends))
+    return "…".join(map(literal, ends))
 
 
 def _plain(name: str, unit: str, *ranges: tuple[float, float], more: Callable[..., Parameters] | None = None) -> Any:

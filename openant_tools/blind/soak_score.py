@@ -15,7 +15,7 @@ import numpy as np
 from openant_tools.blind.soak_set import read_soak_answers, read_verdicts, soak_facts
 from openant_tools.blind.soaks import CAUSES, SoakAnswer
 from openant_tools.files import write_bytes, write_text
-from openant_tools.numbers import number, percent, span, typed
+from openant_tools.numbers import literal, number, percent, span
 from openant_tools.procedure.intervals import wilson
 from openant_tools.report import plots
 
@@ -236,7 +236,7 @@ def write_soak_docs(found: SoakScore, path: Path) -> None:
         "<!-- Written by `openant comms blind score SET --docs docs/comms-blind.md`: do not edit. -->", "",
         "```sh elsewhere",
         f"openant comms blind make --out SET --seed-from COMMIT --key-file KEY --soaks {facts['soaks']} "
-        f"--healthy {typed(facts['mix']['healthy'], 2)} --virtual {typed(facts['mix']['virtual'], 2)}    # answers sealed",
+        f"--healthy {literal(facts['mix']['healthy'], 2)} --virtual {literal(facts['mix']['virtual'], 2)}    # answers sealed",
         "openant comms blind run SET",
         "openant comms blind score SET --key-file KEY --docs docs/comms-blind.md",
         "```", "", *_HOW, "", "## Result", "",

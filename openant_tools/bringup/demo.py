@@ -12,7 +12,7 @@ from openant_tools.bringup.gait import FIRST_STEPS, first_look
 from openant_tools.bringup.stages import Stage, StagedFolder, remove
 from openant_tools.errors import BadInput
 from openant_tools.files import write_text
-from openant_tools.numbers import typed
+from openant_tools.numbers import literal
 from openant_tools.robot.config import CONFIG_NAME
 
 __all__ = ["Demo"]
@@ -137,7 +137,7 @@ class Demo(StagedFolder):
             "--protocol",
             "stand",
             "--seconds",
-            typed(self.record_s),
+            literal(self.record_s),
         )
         fit_json = self.fit / "fit.json"
         stages = [
@@ -194,7 +194,7 @@ class Demo(StagedFolder):
                     f"let it walk from {self.starts} starts, and film it",
                     (
                         (
-                            *("eval", str(training), "--seconds", typed(self.eval_s), "--starts", str(self.starts)),
+                            *("eval", str(training), "--seconds", literal(self.eval_s), "--starts", str(self.starts)),
                             *("--strip", str(self.strip), "--video", str(self.video)),
                             *("--json", str(training / "eval.json")),
                         ),

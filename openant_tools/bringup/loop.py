@@ -19,7 +19,7 @@ from openant_tools.bringup.stages import Stage, StagedFolder
 from openant_tools.errors import BadInput
 from openant_tools.files import json_text, known, read_json, write_text
 from openant_tools.gap.diagnosis import Diagnosis, read_diagnosis
-from openant_tools.numbers import typed
+from openant_tools.numbers import literal
 from openant_tools.procedure.intervals import Interval
 from openant_tools.robot.config import CONFIG_NAME
 from openant_tools.robot.folder import RobotFolder
@@ -211,7 +211,7 @@ class Loop(StagedFolder):
             words,
             (
                 (
-                    *("eval", str(run), *where, "--seconds", typed(self.seconds), "--starts", str(self.starts)),
+                    *("eval", str(run), *where, "--seconds", literal(self.seconds), "--starts", str(self.starts)),
                     *("--seed", str(self.seed), "--json", str(self.played(name))),
                 ),
             ),

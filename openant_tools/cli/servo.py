@@ -9,7 +9,7 @@ import click
 
 from openant_tools.cli.options import POSITIVE, Number, json_option
 from openant_tools.errors import BadInput
-from openant_tools.numbers import exact, number, percent, typed
+from openant_tools.numbers import exact, literal, number, percent
 
 if TYPE_CHECKING:
     from openant_tools.robot.servo_gains import Beside, Conversion
@@ -187,7 +187,7 @@ def _show(result: Conversion, origins: dict[str, str]) -> None:
 
 def _for_mjcf(value: float) -> str:
     """With the digits that are worth typing into a model."""
-    return typed(value, 4)
+    return literal(value, 4)
 
 
 def _show_constants(result: Conversion) -> None:

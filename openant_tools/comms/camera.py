@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from openant_tools.comms.clock import Clock
 from openant_tools.comms.mjpeg import MjpegStream
 from openant_tools.errors import BadInput, HardwareFault
-from openant_tools.numbers import number, typed
+from openant_tools.numbers import literal, number
 from openant_tools.optional import cv2
 
 __all__ = [
@@ -118,7 +118,7 @@ class CameraSetting:
     @property
     def words(self) -> str:
         """Both, for reading."""
-        given, asked = (one if isinstance(one, str) else typed(one) for one in (self.given, self.asked))
+        given, asked = (one if isinstance(one, str) else literal(one) for one in (self.given, self.asked))
         return f"{self.name} {given} instead of {asked}"
 
 

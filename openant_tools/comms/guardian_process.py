@@ -10,7 +10,7 @@ import time
 
 from openant_tools.comms import guardian
 from openant_tools.errors import HardwareFault
-from openant_tools.numbers import typed
+from openant_tools.numbers import literal
 
 __all__ = ["BEAT_S", "PATIENCE_S", "GuardianProcess"]
 
@@ -47,7 +47,8 @@ class GuardianProcess:
         Raises:
             HardwareFault: this computer lets no process begin.
         """
-        words = [sys.executable, "-I", "-S", guardian.__file__, str(port), self._packet.hex(), typed(self._patience_s)]
+        program = [sys.executable, "-I", "-S", guardian.__file__]
+        words = [*program, str(port), self._packet.hex(), literal(self._patience_s)]
         try:
             self._process = subprocess.Popen(words, stdin=subprocess.PIPE, pass_fds=(port,), start_new_session=True)
         except OSError as error:

@@ -17,7 +17,7 @@ from typing import Literal
 
 from openant_tools.comms.troubles import PORT
 from openant_tools.errors import HardwareFault
-from openant_tools.lock import typed
+from openant_tools.lock import command_line
 
 __all__ = ["FLIGHT_CONTROLLER", "U2D2", "Host", "Port", "PortHolder", "explain_open_error", "udev_rule"]
 
@@ -206,7 +206,9 @@ class Host:
         """What a process was started as: of ours as its user typed it, to the first option."""
         words = self._words(pid)
         at = _openant_at(words)
-        return " ".join(words) or _text(self.proc / str(pid) / "comm") if at is None else typed("openant", words[at:])
+        if at is not None:
+            return command_line("openant", words[at:])
+        return " ".join(words) or _text(self.proc / str(pid) / "comm")
 
     def _is_openant(self, pid: int) -> bool:
         return _openant_at(self._words(pid)) is not None

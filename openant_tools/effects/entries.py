@@ -17,7 +17,7 @@ from openant_tools.effects.rollout import EffectValues
 from openant_tools.effects.sensing import SensingEffects
 from openant_tools.errors import BadInput
 from openant_tools.files import read_toml
-from openant_tools.numbers import stored, typed
+from openant_tools.numbers import literal, stored
 from openant_tools.robot.config import ConfigProblem, parse_effects
 from openant_tools.robot.config import EffectEntry as Entry
 from openant_tools.robot.pair import OTHER_REMEDY, PLAIN, mark_of, stranger_words, strangers
@@ -111,9 +111,9 @@ def values_of(entries: Sequence[Entry], joints: Sequence[str], where: str | Path
                 )
             if not parameter.low <= number <= parameter.high:
                 raise BadInput(
-                    f"{entry.effect}.{name} = {typed(number)} {parameter.unit} is not physical",
+                    f"{entry.effect}.{name} = {literal(number)} {parameter.unit} is not physical",
                     where=where,
-                    remedy=f"it lies between {typed(parameter.low)} and {typed(parameter.high)}",
+                    remedy=f"it lies between {literal(parameter.low)} and {literal(parameter.high)}",
                 )
             values.setdefault((entry.effect, name), np.zeros(len(joints)))[rows] = float(number)
     return values
@@ -198,9 +198,9 @@ def _within(entry: Entry, name: str, given: dict[str, list[float]], where: str |
     number = given.get(name, [parameter.absent])[0]
     if not parameter.low <= number <= parameter.high:
         raise BadInput(
-            f"{entry.effect}.{name} = {typed(number)} is not physical",
+            f"{entry.effect}.{name} = {literal(number)} is not physical",
             where=where,
-            remedy=f"it lies between {typed(parameter.low)} and {typed(parameter.high)}",
+            remedy=f"it lies between {literal(parameter.low)} and {literal(parameter.high)}",
         )
     return number
 

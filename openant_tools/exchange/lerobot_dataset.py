@@ -18,7 +18,7 @@ import numpy as np
 
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json, reading
-from openant_tools.numbers import number, typed
+from openant_tools.numbers import literal, number
 from openant_tools.optional import pa
 from openant_tools.recording.plausibility import check_time
 from openant_tools.recording.run import Array
@@ -309,7 +309,7 @@ def _episode(parts: Sequence[_Rows], dataset: DatasetFacts) -> DatasetEpisode:
     )
     if apart is not None and abs(apart * dataset.fps - 1.0) > RATE_SHARE:
         raise BadInput(
-            f"rows are {number(apart, 's')} apart where meta/info.json says {typed(dataset.fps)} a second",
+            f"rows are {number(apart, 's')} apart where meta/info.json says {literal(dataset.fps)} a second",
             where=where,
             remedy="correct `fps` there; `timestamp` is in s",
         )

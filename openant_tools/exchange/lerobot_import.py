@@ -22,7 +22,7 @@ from openant_tools.exchange.lerobot_units import (
     joint_units,
     read_calibration,
 )
-from openant_tools.numbers import number, percent, typed
+from openant_tools.numbers import literal, number, percent
 from openant_tools.recording.plausibility import LIMITS
 from openant_tools.recording.run import Facts, Run
 
@@ -135,7 +135,7 @@ def convert(conversion: DatasetConversion) -> Iterator[Run]:
         if dataset.tasks.get(episode.index):
             notes.append(dataset.tasks[episode.index])
         if episode.counted:
-            notes.append(f"t is the frame over {typed(dataset.fps)} per s, not when a row was taken")
+            notes.append(f"t is the frame over {literal(dataset.fps)} per s, not when a row was taken")
         facts = Facts(names, resolution={"pos": RESOLUTION_RAD} if conversion.whole else {}, notes="; ".join(notes))
         yield Run(f"episode_{episode.index:03d}", facts, episode.t, columns)
 

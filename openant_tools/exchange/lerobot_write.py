@@ -14,7 +14,7 @@ from openant_tools.exchange.card import card
 from openant_tools.exchange.lerobot_dataset import ACTION, DATA_PATH, STATE
 from openant_tools.exchange.source import Source, read_source
 from openant_tools.files import atomic_writer, json_text, write_text
-from openant_tools.numbers import typed
+from openant_tools.numbers import literal
 from openant_tools.optional import pa, pq
 from openant_tools.recording.run import Array, Run
 
@@ -72,7 +72,7 @@ def write_lerobot(paths: Sequence[Path], out: Path, fps: float | None = None) ->
     )
     runs = [f"episode {k}: `{one.run.name}`, {len(episodes[k][ACTION])} frames" for k, one in enumerate(sources)]
     notes = [
-        f"rows are frames of 1/{typed(rate)} s: measurements are interpolated, commands are those in force",
+        f"rows are frames of 1/{literal(rate)} s: measurements are interpolated, commands are those in force",
         f"`{ACTION}` and `{STATE}` are joint angles in degrees; the rest is in SI units (rad/s, m/s², m, rad)",
     ]
     folder = next((one.folder for one in sources if one.folder is not None), None)

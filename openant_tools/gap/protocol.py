@@ -22,7 +22,7 @@ from openant_tools.gap.simulation import simulate
 from openant_tools.model.floor import resolution
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.model.rollout import Rollouts
-from openant_tools.numbers import typed
+from openant_tools.numbers import literal
 from openant_tools.recording.run import Run
 
 __all__ = ["Played", "Players", "RunSet", "alike", "rollouts_of"]
@@ -194,7 +194,7 @@ class RunSet:
         motors = next((one.run.facts.motors for one in self.runs if one.run.facts.motors), {})
         groups: dict[str, list[int]] = {}
         for j, joint in enumerate(self.joints):
-            alike = f"{typed(self.reference.stiffness[j], 4)} {typed(self.reference.limit[j], 4)}"
+            alike = f"{literal(self.reference.stiffness[j], 4)} {literal(self.reference.limit[j], 4)}"
             groups.setdefault(str(motors.get(joint, alike)), []).append(j)
         return list(groups.values())
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.numbers import typed
+from openant_tools.numbers import literal
 
 __all__ = ["HORIZON_S", "Gap", "excess", "gap", "share_closed"]
 
@@ -26,7 +26,7 @@ class Gap:
     full: float
 
     def as_json(self) -> dict[str, float]:
-        return {f"gap_{typed(HORIZON_S)}_s_rad": self.horizon, "gap_full_rad": self.full}
+        return {f"gap_{literal(HORIZON_S)}_s_rad": self.horizon, "gap_full_rad": self.full}
 
 
 def gap(measured: Array, simulated: Array) -> float:

@@ -51,7 +51,7 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, position_servos
-from openant_tools.numbers import typed
+from openant_tools.numbers import literal
 from openant_tools.recording.run import Run
 
 if TYPE_CHECKING:
@@ -464,7 +464,7 @@ def _parts_of(t: Array, whole: Ints, windows: Sequence[tuple[float, float]]) -> 
     for start, stop in windows:
         if start < end or stop <= start:
             raise ValueError(
-                f"the window from {typed(start)} to {typed(stop)} s ends before it begins, or overlaps the one before"
+                f"the window from {literal(start)} to {literal(stop)} s ends before it begins, or overlaps the one before"
             )
         first, beyond = np.searchsorted(t, [start, stop]).tolist()
         complete = whole[(whole >= first) & (whole < beyond - 1)]

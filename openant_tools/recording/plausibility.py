@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
-from openant_tools.numbers import number, typed
+from openant_tools.numbers import literal, number
 from openant_tools.recording.run import BODY_COLUMNS, JOINT_SIGNALS, Array, Run
 
 __all__ = ["LIMITS", "Limit", "check_names", "check_run", "check_time", "need_signals", "problems"]
@@ -110,7 +110,7 @@ def problems(run: Run, where: str) -> Iterator[BadInput]:
         away = np.flatnonzero((command < run.t[0] - 3600.0) | (command > run.t[-1] + 3600.0))
         if len(away):
             yield BadInput(
-                f"cmd_t = {typed(command[away[0]])} s is not on the clock of t",
+                f"cmd_t = {literal(command[away[0]])} s is not on the clock of t",
                 where=_place(where, "cmd_t", int(away[0]), run.t),
                 remedy="give both on the host's monotonic clock, in s",
             )
@@ -169,7 +169,7 @@ def _time_problems(t: Array, where: str) -> Iterator[BadInput]:
         row = int(back[0]) + 1
         how = "repeats" if t[row] == t[row - 1] else "runs backwards"
         yield BadInput(
-            f"time {how}: t = {typed(t[row], 12)} s after {typed(t[row - 1], 12)} s",
+            f"time {how}: t = {literal(t[row], 12)} s after {literal(t[row - 1], 12)} s",
             where=f"{where}, column t, row {row + 1}",
             remedy="sort the rows by time and keep one of each",
         )
@@ -210,12 +210,12 @@ def _value_problems(name: str, values: Array, limit: Limit, t: Array, where: str
         # The farthest value is the one that a reader sees at once to be wrong.
         row = int(np.flatnonzero(wrong)[0])
         unit = JOINT_SIGNALS.get(name.partition(".")[0]) or BODY_COLUMNS.get(name, "")
-        shown = typed(values[row]) + (f" {unit}" if unit not in ("", "1") else "")
+        shown = literal(values[row]) + (f" {unit}" if unit not in ("", "1") else "")
         yield BadInput(f"{shown} cannot be", where=_place(where, name, row, t), remedy=limit.remedy)
 
 
 def _place(where: str, column: str, row: int, t: Array) -> str:
-    return f"{where}, column {column}, row {row + 1} (t = {typed(t[row])} s)"
+    return f"{where}, column {column}, row {row + 1} (t = {literal(t[row])} s)"
 
 
 def _nearest(name: str, known: Sequence[str]) -> str | None:

@@ -18,7 +18,7 @@ from tomlkit.exceptions import TOMLKitError
 
 from openant_tools.errors import BadInput
 from openant_tools.files import decoded, parse_toml
-from openant_tools.numbers import typed
+from openant_tools.numbers import literal
 from openant_tools.robot.fields import ConfigProblem, choice, number, port, read, stranger, switch, text, vector, whole
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS, Kind
 from openant_tools.robot.kit import KITS, PLATFORM_PWM_LIMIT
@@ -412,7 +412,7 @@ def _motors(table: Any, problems: list[ConfigProblem]) -> dict[str, MotorSection
             problems.append(
                 ConfigProblem(
                     f"motors.{motor.joint}.min_rad",
-                    f"{typed(motor.min_rad)} is not below max_rad, {typed(motor.max_rad)}",
+                    f"{literal(motor.min_rad)} is not below max_rad, {literal(motor.max_rad)}",
                     "swap them",
                 )
             )
@@ -490,8 +490,8 @@ def _observation(table: Any, problems: list[ConfigProblem]) -> dict[str, tuple[f
             problems.append(
                 ConfigProblem(
                     f"observation.{column}",
-                    f"{typed(value[0])} to {typed(value[1])} {unit} cannot be",
-                    f"low must be below high, both within ±{typed(largest, 4)} {unit}",
+                    f"{literal(value[0])} to {literal(value[1])} {unit} cannot be",
+                    f"low must be below high, both within ±{literal(largest, 4)} {unit}",
                 )
             )
         else:

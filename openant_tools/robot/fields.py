@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from typing import Any, Literal, TypeVar
 
-from openant_tools.numbers import typed
+from openant_tools.numbers import literal
 
 __all__ = ["ConfigProblem", "choice", "number", "port", "read", "stranger", "switch", "text", "vector", "whole"]
 
@@ -81,10 +81,10 @@ def _parse_number(low: float, high: float, unit: str, or_zero: bool = False) -> 
             raise Unfit(f"is {_a(value)}, but a number is needed{f' ({unit})' if unit else ''}", remedy)
         number = float(value)
         if not low <= number <= high and not (or_zero and number == 0):
-            remedy = f"give {'0, or ' if or_zero else ''}a value from {typed(low)} to {typed(high)}{f' {unit}' if unit else ''}"
+            remedy = f"give {'0, or ' if or_zero else ''}a value from {literal(low)} to {literal(high)}{f' {unit}' if unit else ''}"
             if unit == "rad" and math.isfinite(number) and low <= math.radians(number) <= high:
-                remedy = f"angles stand in rad; if degrees were meant write {typed(math.radians(number))}"
-            raise Unfit(f"{typed(number)}{f' {unit}' if unit else ''} cannot be", remedy)
+                remedy = f"angles stand in rad; if degrees were meant write {literal(math.radians(number))}"
+            raise Unfit(f"{literal(number)}{f' {unit}' if unit else ''} cannot be", remedy)
         return number
 
     return parse

@@ -7,7 +7,7 @@ from pathlib import Path
 from lxml import etree
 
 from openant_tools.errors import BadInput
-from openant_tools.numbers import typed
+from openant_tools.numbers import literal
 from openant_tools.trust import follows_asset
 
 __all__ = ["check_model_file", "parser"]
@@ -119,7 +119,7 @@ def _check_counts(element: etree._Element, where: str) -> None:
             for number in str(one.get(name, "1")).split():
                 product *= max(_number(number), 1.0)
     if product > most > 0:
-        raise BadInput(f"asks for {typed(product, 3)} of its {element.tag}", where=where, remedy=_REMEDY)
+        raise BadInput(f"asks for {literal(product, 3)} of its {element.tag}", where=where, remedy=_REMEDY)
     for name, most in LENGTHS.items():
         if element.get(name) is not None and _number(str(element.get(name))) > most:
             raise BadInput(f"asks for {name} = {element.get(name)}", where=where, remedy=_REMEDY)

@@ -18,7 +18,7 @@ from typing import Any
 
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json, write_bytes
-from openant_tools.numbers import number, typed
+from openant_tools.numbers import literal, number
 from openant_tools.robot.config import MAX_ANGLE_RAD, MAX_OFFSET_RAD, Provenance, RobotConfig, read_document
 from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
@@ -59,10 +59,10 @@ def _number(value: Any, where: str, low: float, high: float, unit: str) -> float
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise BadInput("is no number", where=where)
     if not low <= value <= high:
-        remedy = f"{typed(low, 4)} to {typed(high, 4)}"
+        remedy = f"{literal(low, 4)} to {literal(high, 4)}"
         if unit == "rad" and math.radians(abs(value)) <= high:
-            remedy = f"if degrees were meant write {typed(math.radians(value))}"
-        raise BadInput(f"{typed(value)} {unit} cannot be", where=where, remedy=remedy)
+            remedy = f"if degrees were meant write {literal(math.radians(value))}"
+        raise BadInput(f"{literal(value)} {unit} cannot be", where=where, remedy=remedy)
     return float(value)
 
 
@@ -147,7 +147,7 @@ def _read_motors(motors: Any, path: Path, values: dict[str, Any], notes: list[st
         offset = values.get(f"motors.{joint.name}.zero_offset_rad")
         if offset is not None and off_grid(offset) > 1e-4:
             notes.append(
-                f"the offset of {joint.name}, {typed(offset)} rad, is {number(off_grid(offset), 'rad')} off the "
+                f"the offset of {joint.name}, {literal(offset)} rad, is {number(off_grid(offset), 'rad')} off the "
                 "multiples of 45° that the platform's config maker writes"
             )
 

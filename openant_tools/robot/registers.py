@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
-from openant_tools.numbers import typed
+from openant_tools.numbers import literal
 
 __all__ = [
     "EEPROM_END", "LOAD_PER_COUNT", "PULSES_PER_TURN", "PWM_FULL", "RAD_PER_PULSE", "RAD_S_PER_COUNT", "Register",
@@ -96,7 +96,7 @@ class Register:
             unit = f" {self.unit}" if self.unit else ""
             ends = f"{low} to {high}"
             if self.scale != 1:
-                ends += f", that is {typed(low * self.scale, 4)} to {typed(high * self.scale, 4)}{unit}"
+                ends += f", that is {literal(low * self.scale, 4)} to {literal(high * self.scale, 4)}{unit}"
             raise BadInput(f"{self.name} cannot be {counts} (it goes from {ends})")
 
     @property

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from openant_tools.errors import BadInput
 from openant_tools.files import read_toml
-from openant_tools.numbers import exact, typed
+from openant_tools.numbers import exact, literal
 from openant_tools.robot import gains
 from openant_tools.robot.config import Provenance
 from openant_tools.robot.control_table import GAIN_MAX
@@ -76,9 +76,12 @@ class Mjcf:
     @property
     def lines(self) -> tuple[str, ...]:
         """As they stand in a model."""
-        joint = (f'<joint damping="{typed(self.damping, 4)}"/>',) if self.damping else ()
-        force = typed(self.force_nm, 4)
-        return (*joint, f'<position kp="{typed(self.kp, 4)}" kv="{typed(self.kv, 4)}" forcerange="-{force} {force}"/>')
+        joint = (f'<joint damping="{literal(self.damping, 4)}"/>',) if self.damping else ()
+        force = literal(self.force_nm, 4)
+        return (
+            *joint,
+            f'<position kp="{literal(self.kp, 4)}" kv="{literal(self.kv, 4)}" forcerange="-{force} {force}"/>',
+        )
 
 
 @dataclass(frozen=True)
@@ -206,7 +209,7 @@ def registers_for(
         # A kv that was read off four digits may lie a hair below what the motor alone gives.
         if d < -0.5 and wanted.kv < slope * (1 - 1e-3):
             raise BadInput(
-                f"kv {exact(wanted.kv, 'N·m·s/rad')} is less than the back-EMF of {at}, {typed(slope, 4)}, which no register takes away",
+                f"kv {exact(wanted.kv, 'N·m·s/rad')} is less than the back-EMF of {at}, {literal(slope, 4)}, which no register takes away",
                 remedy="ask for that or more, or, where the model's joint damping holds it, add --back-emf joint",
             )
         d_count = _count("kv", "N·m·s/rad", wanted.kv, max(d, 0.0), most, GAIN_MAX, at, may_be_zero=True)
@@ -238,15 +241,15 @@ def _count(
     if count < 1 and not may_be_zero:
         raise BadInput(
             f"{name} {exact(value, unit)} is less than one count of the register gives on {at}",
-            remedy=f"ask for {typed(most / largest, 2)} or more",
+            remedy=f"ask for {literal(most / largest, 2)} or more",
         )
     return count
 
 
 def _below(most: float) -> str:
     """Four digits that are no more than `most`."""
-    text = typed(most, 4)
-    return text if float(text) <= most else typed(most * (1 - 5e-4), 4)
+    text = literal(most, 4)
+    return text if float(text) <= most else literal(most * (1 - 5e-4), 4)
 
 
 def conversion(
@@ -456,7 +459,7 @@ def beside(result: Conversion, folder: RobotFolder) -> list[Beside]:
                 continue
             origins = {kind: config.provenance_of(f"identified.{kind}.{joint}") for kind in parts}
             single = origins[next(iter(parts))] if len(parts) == 1 else None
-            words = [f"{kind} {typed(value, 4)}, {_origin(origins[kind])}" for kind, value in parts.items()]
+            words = [f"{kind} {literal(value, 4)}, {_origin(origins[kind])}" for kind, value in parts.items()]
             rows.append(
                 Beside(
                     joint, name, sheet[name], sum(parts.values()), single.low if single else None,

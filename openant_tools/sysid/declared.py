@@ -35,7 +35,7 @@ from openant_tools.errors import BadInput
 from openant_tools.files import read_toml
 from openant_tools.model.attribute import find
 from openant_tools.model.plant import Plant
-from openant_tools.numbers import typed
+from openant_tools.numbers import literal
 from openant_tools.sysid.kinds import KINDS, Kind
 from openant_tools.sysid.parameter import Parameter, Place, given_numbers
 
@@ -163,7 +163,7 @@ def _entry(entry: Mapping[str, Any], number: int, path: Path) -> Declared:
     if not (math.isfinite(std) and std > 0):
         raise refuse(f"std is {entry['std']!r}", "give the prior's standard deviation, above 0")
     if not low < high:
-        raise refuse(f"low {typed(low)} is not below high {typed(high)}", "swap them")
+        raise refuse(f"low {literal(low)} is not below high {literal(high)}", "swap them")
     index = entry.get("index")
     if isinstance(index, list) and not (index and all(isinstance(k, int) for k in index)):
         raise refuse(f"index is {index!r}", "give one whole number, or a list of them, from 0")
@@ -231,7 +231,7 @@ def _check(entry: Declared, place: Place, model: Path, where: str) -> None:
         )
     if not entry.low <= chosen[0] <= entry.high:
         raise BadInput(
-            f"the {entry.attribute} of {place.attribute} is {typed(chosen[0])}, outside {typed(entry.low)} … {typed(entry.high)}",
+            f"the {entry.attribute} of {place.attribute} is {literal(chosen[0])}, outside {literal(entry.low)} … {literal(entry.high)}",
             where=where,
             remedy="widen low and high",
         )

@@ -24,7 +24,7 @@ from openant_tools.effects.rollout import EffectValues
 from openant_tools.model.attribute import Attribute, stated
 from openant_tools.model.plant import Plant
 from openant_tools.model.servo import hold_still, usual_torque
-from openant_tools.numbers import typed
+from openant_tools.numbers import literal
 from openant_tools.sysid.kinds import ACTION_DELAY, ELECTRICAL_DAMPING, KINDS, LOAD_FRICTION, Kind
 
 __all__ = [
@@ -333,7 +333,7 @@ def _groups(plant: Plant, kind: Kind, tie: str, motors: Mapping[str, str]) -> di
     if kind.alike:
         by_value: dict[str, list[int]] = {}
         for j in range(len(plant.joints)):
-            by_value.setdefault(typed(kind.read(plant.model, plant, j)), []).append(j)
+            by_value.setdefault(literal(kind.read(plant.model, plant, j)), []).append(j)
         for members in by_value.values():
             words = {plant.joints[j].partition("_")[0] for j in members}
             shared = words.pop() if len(words) == 1 else plant.joints[members[0]]

@@ -13,7 +13,7 @@ import tomlkit
 
 from openant_tools.errors import BadInput
 from openant_tools.files import read_toml, write_text
-from openant_tools.numbers import exact, number, typed
+from openant_tools.numbers import exact, literal, number
 from openant_tools.sysid import excitation, floor_motion
 from openant_tools.sysid.excitation import Segment
 from openant_tools.sysid.protocols import LONGEST_S, Protocol
@@ -153,9 +153,9 @@ def _value(kind: Any, key: str, value: Any, where: str) -> Any:
         return items
     given = _number(value, key, where)
     if key.endswith("share") and not 0 < given <= 1:
-        raise BadInput(f"`{key}` is {typed(given)}, not a share between 0 and 1", where=where, remedy="correct it")
+        raise BadInput(f"`{key}` is {literal(given)}, not a share between 0 and 1", where=where, remedy="correct it")
     if given <= 0:
-        raise BadInput(f"`{key}` is {typed(given)}, it must be more than 0", where=where, remedy="correct it")
+        raise BadInput(f"`{key}` is {literal(given)}, it must be more than 0", where=where, remedy="correct it")
     return given
 
 

@@ -22,7 +22,7 @@ from openant_tools.model.plant import Plant, beside_servos, position_servos
 from openant_tools.model.rollout import Rollouts
 from openant_tools.model.servo import read_stiffness, torque_limit
 from openant_tools.model.stability import NUDGE, growth
-from openant_tools.numbers import exact, number, percent, typed
+from openant_tools.numbers import exact, literal, number, percent
 from openant_tools.numbers import span as angles
 from openant_tools.recording.run import Run
 from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE, RAD_S_PER_COUNT
@@ -541,13 +541,13 @@ def _geared(case: Case) -> Found:
         if math.isclose(gear, 1.0, rel_tol=1e-6):
             continue
         kp, kv = -float(model.actuator_biasprm[i, 1]) * gear**2, -float(model.actuator_biasprm[i, 2]) * gear**2
-        same = f"kp={typed(kp, 4)}" + (f" kv={typed(kv, 4)}" if kv else "")
+        same = f"kp={literal(kp, 4)}" + (f" kv={literal(kv, 4)}" if kv else "")
         if model.actuator_forcelimited[i]:
             low, high = sorted(float(end) * gear for end in model.actuator_forcerange[i])
-            same += f" forcerange={typed(low, 4)} {typed(high, 4)}"
+            same += f" forcerange={literal(low, 4)} {literal(high, 4)}"
         affine = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
         yield (
-            f"the actuator of {joint} has gear {typed(gear)}: MuJoCo turns the joint to command / gear, a servo to its command",
+            f"the actuator of {joint} has gear {literal(gear)}: MuJoCo turns the joint to command / gear, a servo to its command",
             f"write the servo at the joint, with gear 1: {same}" if affine and gear > 0 else
             "give it gear 1 and its numbers at the joint; where a servo turns backwards, turn the joint's axis",
         )  # fmt: skip
@@ -701,7 +701,9 @@ def _unstable(case: Case) -> Found:
         calm = next((n for n in FINER if not any(_grows(case, pose, n) for pose in restless)), None)
     else:
         return
-    helps = f'timestep="{typed(case.plant.timestep / calm, 3)}" keeps it together' if calm else "shorten its `timestep`"
+    helps = (
+        f'timestep="{literal(case.plant.timestep / calm, 3)}" keeps it together' if calm else "shorten its `timestep`"
+    )
     yield (
         f"the model is unstable: {what}",
         f'{helps}; or take integrator="implicitfast", or check stiffness, armature and damping',

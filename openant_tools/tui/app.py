@@ -499,7 +499,7 @@ class OpenAnt(App[int]):
 
     # ---- a step by its number ------------------------------------------------------------------------------------
 
-    def typed(self, digit: str) -> None:
+    def take_digit(self, digit: str) -> None:
         """A digit of a step's number, which Enter opens."""
         number = self._typed + digit if f"{self._typed}{digit}" in _NUMBERS else digit
         if number not in _NUMBERS:

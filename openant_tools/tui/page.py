@@ -66,7 +66,7 @@ class Program(Protocol):
     def diagnose(self, recording: Path) -> None:
         """Have a recording diagnosed, on the screen of the gap."""
 
-    def typed(self, digit: str) -> None:
+    def take_digit(self, digit: str) -> None:
         """A digit of a step's number, which Enter opens."""
 
 
@@ -211,7 +211,7 @@ class Page(Screen[None]):
         """A digit that nothing else wants is one of a step's number."""
         if event.character is not None and event.character in "0123456789" and not isinstance(self.focused, Input):
             event.stop()
-            self.ant.typed(event.character)
+            self.ant.take_digit(event.character)
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
         # Of a key that was pressed twice the second may find its line gone, or another screen on top.

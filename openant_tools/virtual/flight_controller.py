@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from openant_tools.comms import msp
 from openant_tools.comms.msp import Command, Direction, MspFrame
-from openant_tools.numbers import typed
+from openant_tools.numbers import literal
 
 __all__ = ["BodyState", "FlightController", "FlightControllerSettings"]
 
@@ -438,7 +438,7 @@ class FlightController:
             self._rate_typed = float(value)
             return f"{name} set to {value}".encode()
         if line in ("get serial_update_rate_hz", ""):
-            return f"serial_update_rate_hz = {typed(self._rate_typed)}".encode() if line else b""
+            return f"serial_update_rate_hz = {literal(self._rate_typed)}".encode() if line else b""
         return b"unknown command, try 'help'"
 
 

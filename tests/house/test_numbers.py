@@ -13,7 +13,7 @@ from readable import unreadable
 from sources import modules
 
 from openant_tools.comms.hardware import changes
-from openant_tools.numbers import chosen, column, exact, number, percent, span, typed
+from openant_tools.numbers import chosen, column, exact, literal, number, percent, span
 from openant_tools.procedure.journal import EepromWrite
 
 
@@ -51,7 +51,7 @@ def test_columns_signs_and_shares():
     assert column((0.02, 0.045), "m") == ["20 mm", "45 mm"]
     assert exact(0.5, "s") == "0.5 s"
     assert exact(1_000_000, "baud") == "1000000 baud"
-    assert (typed(-0.7853981634), typed(3.0), typed(1.23456, 4)) == ("-0.785398", "3", "1.235")
+    assert (literal(-0.7853981634), literal(3.0), literal(1.23456, 4)) == ("-0.785398", "3", "1.235")
     assert (chosen(0.005, "share"), chosen(math.radians(2), "rad")) == ("0.5 %", "2°")
     assert [percent(share) for share in (0.0, 0.0004, 0.06, 1.0, None)] == [
         "0 %",
