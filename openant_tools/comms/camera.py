@@ -642,6 +642,8 @@ class _Snapshots:
         self._count = 0
         self._frozen = _Frozen()
         self._gone = False
+        #: before this time there is no other picture than the last
+        self._next = -math.inf
         self._began = self._arrived = clock.now()
         while (frame := self.newest()) is None:
             if clock.now() - self._began > FIRST_FRAME_TIMEOUT_S or self._gone:
@@ -656,6 +658,8 @@ class _Snapshots:
 
     def newest(self) -> Frame | None:
         now = self._clock.now()
+        if now < self._next:
+            return self._frame
         self._clock.sleep_until(now)  # what was sent to the robot so far has its effect first
         try:
             self._http.request("GET", f"/snapshot.jpg?at={now:.9f}")  # for a file
@@ -668,6 +672,7 @@ class _Snapshots:
         self._gone = False
         if answer.status != 200:
             return None
+        self._next = float(answer.headers["X-Next"])
         number = (int(answer.headers["X-Frame"]), int(answer.headers["X-Ordinal"]))
         if number != self._last:
             image: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)

@@ -5,7 +5,8 @@ happens here, so that the timing of the bus does not suffer. The addresses are t
 
 * `/stream.mjpg`: the pictures as they are delivered, which `cv2.VideoCapture` opens;
 * `/snapshot.jpg`: the last picture delivered, 204 while there is none; with `?at=T`, the last one delivered at robot
-  time T. That is how a stepped robot is watched: rendered on demand, and the same at every run.
+  time T. That is how a stepped robot is watched: rendered on demand, and the same at every run. `X-Next` says before which
+  robot time it stays the last one, so that nobody asks ten times for one picture.
 
 Every picture says in its header when it was exposed (`X-Timestamp`, s: robot time if stepped, else CLOCK_MONOTONIC),
 when it was delivered (`X-Delivered`), which exposure it is (`X-Frame`) and how many were delivered before it
@@ -208,6 +209,8 @@ class _Feed:
         self._rendered: OrderedDict[int, _Picture] = OrderedDict()
         self._held: _Picture | None = None
         self._delivered = 0
+        #: the last exposure of which the robot told, whether or not a picture of it is delivered
+        self._told = -1
         self._render_lock = threading.Lock()
         if not self.stepped:
             _ = self._optics  # what is to come in time is got ready; a stepped robot waits for the first picture
@@ -228,6 +231,7 @@ class _Feed:
         taken = t if self.stepped else monotonic
         due = taken + s.latency_s + (2.0 * late - 1.0) * s.latency_jitter_s
         with self.changed:
+            self._told = index
             if self.fault in ("stalled", "gone") or drop < s.drop:
                 return
             # A driver hands pictures over in order.
@@ -304,8 +308,8 @@ class _Feed:
             self._held = self._held or picture
             return _Picture(picture.exposure, self._held.data)
 
-    def snapshot(self, at: float | None) -> _Picture | None:
-        """The last picture delivered by `at` (default now)."""
+    def snapshot(self, at: float | None) -> tuple[_Picture, float] | None:
+        """The last picture delivered by `at` (default now), and before which time there is no other."""
         with self.changed:
             now = self.now() if at is None else at
             dues = [exposure.due for exposure in self._history]
@@ -313,7 +317,10 @@ class _Feed:
             if not found:
                 return None
             exposure = self._history[found - 1]
-        return self._frozen(self.picture(exposure))
+            s = self.settings
+            untold = (self._told + 1) / s.fps + s.latency_s - s.latency_jitter_s
+            until = min([untold, *dues[found : found + 1]])
+        return self._frozen(self.picture(exposure)), until
 
 
 class _Server(http.server.ThreadingHTTPServer):
@@ -343,13 +350,15 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         if url.path == "/stream.mjpg":
             self._stream(feed)
         elif url.path == "/snapshot.jpg":
-            picture = feed.snapshot(at[0] if at else None)
-            if picture is None:
+            last = feed.snapshot(at[0] if at else None)
+            if last is None:
                 self.send_response(204)
                 self.send_header("Content-Length", "0")
                 self.end_headers()
             else:
-                self.wfile.write(b"HTTP/1.1 200 OK\r\n" + picture.header + picture.data)
+                picture, until = last
+                status = f"HTTP/1.1 200 OK\r\nX-Next: {until:.9f}\r\n"  # for a file
+                self.wfile.write(status.encode() + picture.header + picture.data)
         else:
             self.send_error(404)
 

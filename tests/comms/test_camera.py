@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import math
 import threading
 import time
@@ -428,6 +429,30 @@ def test_under_a_stepped_clock_latency_and_drops_are_measured_right(stepped: Ste
     known.open()
     frame = known.wait(stepped.t + 1)
     assert frame.t == pytest.approx(frame.arrived - 0.062, abs=2e-3)
+
+
+def test_who_looks_often_asks_seldom_and_sees_every_picture_as_it_comes(
+    stepped: SteppedHost, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driver, asked, send = Camera(CameraSettings(stepped.camera.wait()), stepped), [], http.client.HTTPConnection.request
+
+    def counted(*given: Any, **more: Any) -> None:
+        asked.append(stepped.t)
+        send(*given, **more)
+
+    monkeypatch.setattr(http.client.HTTPConnection, "request", counted)
+    driver.open()
+    late, begin, before = [], stepped.t, len(asked)
+    while stepped.t < begin + 1.0:
+        stepped.sleep_until(stepped.t + 0.001)
+        if (frame := driver.newest()) is not None:
+            late.append(stepped.t - frame.arrived)
+        assert driver.fault() is None
+    assert len(late) > 20
+    assert min(late[1:]) >= 0
+    assert max(late[1:]) < 0.001 + 1e-6
+    assert driver.statistics.skipped == 0
+    assert len(asked) - before < 15 * len(late), "not at each of a thousand looks, twice"
 
 
 def test_under_a_stepped_clock_every_run_is_the_same(stepped: SteppedHost) -> None:
