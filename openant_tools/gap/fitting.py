@@ -193,13 +193,14 @@ class Fits:
         self.solver.follow(every, fitted, ITERATIONS)
         if self._least == np.inf:
             self._choose_form(every[0], fitted)
-        if not self._learnt:
+        if not learnt:
             self._go_on(every, fitted)
         return [min(some, key=lambda one: one.least) for some in descents]
 
     def _finish(self, descents: Sequence[Descent], fitted: Sequence[int]) -> list[Descent]:
         """Follow those that leave least by slopes of tolerances that are learnt where they have come to."""
-        finished = sorted(descents, key=lambda one: one.least)[:FINISHED]
+        floor = any(self._on_floor(k) for k in fitted)
+        finished = sorted(descents, key=lambda one: one.least)[:FINISHED] if floor else []
         self._go_on(finished, fitted)
         return finished
 
