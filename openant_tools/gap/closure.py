@@ -29,9 +29,10 @@ class Closure:
     Attributes:
         before, after, floor: rad, of joints. closed: share of the excess that is gone; low, high: over the folds, 95 %.
         joints: how many channels are positions, the first ones.
-        squares: (folds, channels) summed over rows; counts: (folds, channels) of how many errors.
+        squares: (folds, channels) summed over rows, of errors in deviations that sensors and feet that chatter give them; counts: (folds,
+            channels) of how many.
         apart: (folds, channels) squares of how far it is from what it is compared with, summed over the same rows.
-        known: (channels,) mean square of sensors. likelihood, within, std: as of `Fit`.
+        likelihood, within, std: as of `Fit`.
         refit: on all training runs together. irregular: what it leaves says of commands.
     """
 
@@ -47,7 +48,6 @@ class Closure:
     squares: Array
     apart: Array
     counts: Array
-    known: Array
     refit: Refit
     std: tuple[Mapping[str, float], ...]
     irregular: Irregular
@@ -56,7 +56,7 @@ class Closure:
         """Logarithm of how much less it leaves than another on the same folds, rms, mean of them, summed over joints and body sensors.
 
         Up to a factor that of their likelihoods, where errors of each channel on each fold have a size of their own that nobody knows,
-        but not less than sensors'.
+        but not less than they are known to.
         """
         return self._less(other.squares)
 
@@ -69,9 +69,8 @@ class Closure:
     def uneven(self) -> float:
         """Logarithm of how many times its sensors' errors the joint that it leaves worst keeps on held-out folds, rms, mean of them, less that
         of the median joint."""
-        known = self.known[: self.joints]
         squares, counts = self.squares[:, : self.joints], self.counts[:, : self.joints]
-        each = 0.5 * np.log1p(squares / np.maximum(counts, 1.0) / known)
+        each = 0.5 * np.log1p(squares / np.maximum(counts, 1.0))
         joints = each.sum(axis=0) / np.maximum((counts > 0).sum(axis=0), 1)
         return float(joints.max() - np.median(joints))
 
@@ -81,7 +80,7 @@ class Closure:
 
     def _less(self, squares: Array) -> float:
         rows = np.maximum(self.counts, 1.0)  # of a fold without any nothing is left
-        each = np.log((squares / rows + self.known) / (self.squares / rows + self.known))
+        each = np.log((squares / rows + 1) / (self.squares / rows + 1))
         return float(0.5 * each.sum()) / len(rows)
 
 
@@ -106,9 +105,10 @@ def closures(
             errors = predictions.over_windows(k, held_out)
             for mine, of_one in zip(left, errors, strict=True):
                 mine.setdefault(k, of_one[:, : predictions.joints])
-            squares, good = _squares(errors)
+            deviations = errors / fits.solver.deviation(k, found[0].whole)
+            squares, good = _squares(deviations)
             each[:, f], counts[f] = each[:, f] + squares, counts[f] + good
-            apart[:, f] += _squares(errors - errors[0])[0]
+            apart[:, f] += _squares(deviations - deviations[0])[0]
             squares, good = _squares(np.concatenate([predictions.before(k)[None], predictions.errors(k, held_out)]))
             gaps[:, f] += squares.sum(axis=1)
             known[f] += good.sum()
@@ -121,7 +121,7 @@ def closures(
         out.append(
             Closure(
                 before, after, floor, _closed(before, after, floor), low, high, one.likelihood, one.within, predictions.joints,
-                each[n], apart[n], counts, predictions.sigma**2, one.whole, one.std, _irregular(predictions, one.whole, left[n]),
+                each[n], apart[n], counts, one.whole, one.std, _irregular(predictions, one.whole, left[n]),
             )
         )  # fmt: skip
     return out

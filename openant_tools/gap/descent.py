@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from openant_tools.gap.features import Floats
 from openant_tools.gap.hypothesis import Refit, bounds_of, prior_of, quantities, sizes
-from openant_tools.model.plant import Setup
 
 __all__ = ["END", "LEAST_GAIN", "Block", "Descent"]
 
@@ -23,10 +22,9 @@ SPREAD, END = 0.6, 1.0
 SETTLED, LEAST_GAIN = 0.03, 2.0
 #: times all that is known of each coordinate by which a step is held back that made things worse, by so much more each time; and at most
 HELD_BACK, MOST = 4.0, 64.0
-#: by how much each is varied to learn its slope, in tolerances, on a floor so far that it is not the slope of feet that chatter; as a share of
-#: a size, of the least that matters where there is none, and of a shape's range
-NEARBY = {Setup.STAND: 0.3, Setup.FLOOR: 1.0}
-NEARBY_SIZE, NEARBY_NONE, NEARBY_SHAPE = 0.15, 0.5, 0.1
+#: by how much each is varied to learn its slope, in tolerances; as a share of a size, of the least that matters where there is none, and of a
+#: shape's range
+NEARBY, NEARBY_SIZE, NEARBY_NONE, NEARBY_SHAPE = 0.3, 0.15, 0.5, 0.1
 
 
 @dataclass(frozen=True)
@@ -154,9 +152,9 @@ class Descent:
             self, low=np.where(still, self.u, self.low), high=np.where(still, self.u, self.high), bends=self.bends & ~still,
         )  # fmt: skip
 
-    def begin(self, slopes: Mapping[int, Floats]) -> None:
-        """Once more, from where it was best, with what slopes are known of some runs."""
-        self.u, self.damping, self.least, self.slopes, self.errors = self.at, 0.0, np.inf, dict(slopes), {}
+    def begin(self) -> None:
+        """Once more, from where it was best, with slopes that are looked at there."""
+        self.u, self.damping, self.least, self.slopes, self.errors = self.at, 0.0, np.inf, {}, {}
 
     @property
     def goes_on(self) -> bool:
@@ -167,16 +165,22 @@ class Descent:
             and bool((np.abs(self.u - self.at) > SETTLED * self.steps).any())
         )
 
-    def steps_on(self, setup: Setup) -> Array:
-        """(coordinates,) by how much each is varied."""
-        return np.concatenate([self.steps[: self.causes], NEARBY[setup] * self.steps[self.causes :]])
+    @property
+    def nearby(self) -> Array:
+        """(coordinates,) by how much each is varied to learn its slope."""
+        return np.concatenate([self.steps[: self.causes], NEARBY * self.steps[self.causes :]])
 
-    def moved(self, members: Iterable[tuple[int, NDArray[np.bool_]]], steps: Array) -> Array:
-        """Where it is with some coordinates a step farther."""
+    def moved(self, members: Iterable[tuple[int, NDArray[np.bool_]]]) -> Array:
+        """Where it looks next, with some coordinates a step farther."""
         out = self.u.copy()
         for p, _ in members:
-            out[p] += steps[p]
+            out[p] += self.nearby[p]
         return out
+
+    def spread(self, moved: Array) -> list[Array]:
+        """The same with all tolerances so many steps farther, of each robot: (robots, tolerances)."""
+        causes = np.zeros((len(moved), self.causes))
+        return list(self.u + np.concatenate([causes, moved], axis=1) * self.nearby)
 
     def told(self, found: Mapping[int, Floats], counts: Mapping[int, Array]) -> None:
         """What each run showed where it looked: weighted errors, and of how many independent ones they are."""

@@ -193,23 +193,24 @@ class Fits:
         self.solver.follow(every, fitted, ITERATIONS)
         if self._least == np.inf:
             self._choose_form(every[0], fitted)
-        self._go_on(every, fitted, on_floor=not learnt)
+        if not learnt:
+            self._go_on(every, fitted)
         return [min(some, key=lambda one: one.least) for some in descents]
 
     def _finish(self, descents: Sequence[Descent], fitted: Sequence[int]) -> list[Descent]:
-        """Follow those that leave least by slopes of tolerances that are learnt where they have come to, on the floor as well."""
+        """Follow those that leave least by slopes of tolerances that are learnt where they have come to."""
         floor = any(self._on_floor(k) for k in fitted)
         finished = sorted(descents, key=lambda one: one.least)[:FINISHED] if floor else []
-        self._go_on(finished, fitted, on_floor=True)
+        self._go_on(finished, fitted)
         return finished
 
-    def _go_on(self, descents: Sequence[Descent], fitted: Sequence[int], *, on_floor: bool) -> None:
-        """Follow by slopes that are measured where each has come to, as long as those lead on; `on_floor`: there, too."""
+    def _go_on(self, descents: Sequence[Descent], fitted: Sequence[int]) -> None:
+        """Follow by slopes that are measured where each has come to, as long as those lead on."""
         begun = list(descents)
         for _ in range(MEASURED - 1):
             before = [one.least for one in begun]
             for one in begun:
-                one.begin({} if on_floor else {k: slopes for k, slopes in one.slopes.items() if self._on_floor(k)})
+                one.begin()
             self.solver.follow(begun, fitted, ITERATIONS)
             begun = [one for one, cost in zip(begun, before, strict=True) if cost - one.least > 2 * LEAST_GAIN]
 

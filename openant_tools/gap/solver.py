@@ -18,8 +18,9 @@ from scipy.optimize import lsq_linear
 
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.descent import Descent
+from openant_tools.gap.design import design, scatter, slopes
 from openant_tools.gap.features import Floats
-from openant_tools.gap.hypothesis import refit_at
+from openant_tools.gap.hypothesis import Refit, refit_at
 from openant_tools.gap.nuisance import TILTS
 from openant_tools.gap.prediction import Predictions
 from openant_tools.model.plant import Setup
@@ -52,6 +53,7 @@ class Solver:
         self.predictions = predictions
         self._of_tolerances: dict[int, list[Column]] = {}
         self._workers: ProcessPoolExecutor | None = None
+        self._scatter: dict[int, Array] = {}
 
     def follow(self, descents: Sequence[Descent], fitted: Sequence[int], at_most: int) -> None:
         """Take so many steps of each, or until it does not go on, simulated on the runs that it is fitted to."""
@@ -69,30 +71,36 @@ class Solver:
         found: list[dict[int, Floats]] = [{} for _ in descents]
         runs = [mine for mine, _ in self.predictions.side_by_side(fitted)]
         columns = [[self._columns(mine[0], one) for one in descents] for mine in runs]
-        steps = [
-            [one.steps_on(self.predictions.protocol.runs[mine[0]].plant.setup) for one in descents] for mine in runs
-        ]
+        designs = [[self._design(mine[0], one) for one in descents] for mine in runs]
         robots = [
             [
                 self.predictions.robot(refit_at(one.start, u), mine[0])
-                for one, some, by in zip(descents, of_runs, steps_there, strict=True)
-                for u in (one.u, *(one.moved(members, by) for members in some))
+                for one, some, moved in zip(descents, of_runs, of_designs, strict=True)
+                for u in (one.u, *map(one.moved, some), *one.spread(moved))
             ]
-            for mine, of_runs, steps_there in zip(runs, columns, steps, strict=True)
+            for mine, of_runs, of_designs in zip(runs, columns, designs, strict=True)
         ]
-        for mine, of_runs, steps_there, there in zip(runs, columns, steps, self._errors(fitted, robots), strict=True):
+        for mine, of_runs, of_designs, there in zip(runs, columns, designs, self._errors(fitted, robots), strict=True):
             for k, errors in zip(mine, there, strict=True):
-                weight, at = self._weight(k), 0
-                for one, some, by, seen in zip(descents, of_runs, steps_there, found, strict=True):
-                    seen[k] = (np.nan_to_num(errors[at]) * weight).astype(np.float32)
+                at = 0
+                for one, some, moved, seen in zip(descents, of_runs, of_designs, found, strict=True):
+                    size = 1 + len(some) + len(moved)
+                    shown = np.nan_to_num(errors[at : at + size])
+                    at += size
+                    if len(moved):
+                        # Once, so that all hypotheses are weighed alike.
+                        self._scatter.setdefault(k, scatter(shown[1 + len(some) :], moved))
+                    shown = shown * self._weight(k)
+                    seen[k] = shown[0].astype(np.float32)
                     change_by = np.zeros((len(one.u), *seen[k].shape), np.float32)
                     if k in one.slopes:
                         change_by[:] = one.slopes[k]
-                    for row, members in enumerate(some, at + 1):
-                        change = np.nan_to_num(errors[row] - errors[at]) * weight
+                    for row, members in enumerate(some, 1):
                         for p, mask in members:
-                            change_by[p] = np.where(mask, change, 0.0) / by[p]
-                    at += 1 + len(some)
+                            change_by[p] = np.where(mask, shown[row] - shown[0], 0.0) / one.nearby[p]
+                    if len(moved):
+                        steps = one.nearby[one.causes :, None, None]
+                        change_by[one.causes :] = slopes(shown[1 + len(some) :], moved) / steps
                     one.slopes[k] = change_by
         for one, seen in zip(descents, found, strict=True):
             one.told(seen, {k: self._count(k) for k in fitted})
@@ -128,6 +136,20 @@ class Solver:
             for group in range(len(groups))
         ]
 
+    def deviation(self, k: int, near: Refit) -> Array:
+        """(rows, channels) or (channels,) how far errors of a run are off by sensors and by feet that chatter.
+
+        Args:
+            near: where that is looked at, on a run that nothing was fitted to.
+        """
+        if self._chatters(k) and k not in self._scatter:
+            moved = design(len(near.nuisance))
+            some = Descent.of(near, len(near.nuisance), {}).spread(moved)
+            [[seen]] = self._errors([k], [[self.predictions.robot(refit_at(near, u), k) for u in some]])
+            self._scatter[k] = scatter(np.nan_to_num(seen), moved)
+        out: Array = np.sqrt(np.square(self.predictions.sigma) + self._scatter.get(k, 0.0))
+        return out
+
     def solve(self, descent: Descent, runs: Sequence[int]) -> Array:
         """Where the blocks of some runs lead, made where the descent was best."""
         u, prior, scale = descent.at, descent.prior, descent.scale
@@ -149,12 +171,23 @@ class Solver:
         return found
 
     def _columns(self, k: int, descent: Descent) -> list[Column]:
-        """What is varied on a run. A joint within tolerance moves little: slopes once known are not looked at again."""
+        """What is varied by itself on a run. A joint within tolerance moves little: slopes once known are not looked at again."""
         everywhere = np.ones(len(self.predictions.sigma), bool)
         own: list[Column] = [[(p, everywhere)] for p in range(descent.causes)]
         if k in descent.slopes:
             return [members for members in own if descent.bends[members[0][0]]]
+        if self._chatters(k):
+            return own
         return own + [[(descent.causes + p, mask) for p, mask in members] for members in self._tolerances(k)]
+
+    def _design(self, k: int, descent: Descent) -> Array:
+        """(robots, tolerances) that are varied at once on a run; none where they are varied by themselves, or slopes are known."""
+        tolerances = len(self.predictions.names)
+        return design(tolerances) if self._chatters(k) and k not in descent.slopes else np.empty((0, tolerances))
+
+    def _chatters(self, k: int) -> bool:
+        """Whether robots that hardly differ may do otherwise on a run: those whose feet are on a floor."""
+        return self.predictions.protocol.runs[k].plant.setup is Setup.FLOOR
 
     def _tolerances(self, k: int) -> list[Column]:
         """Those that one simulation can vary, because on the stand legs do not move each other."""
@@ -182,18 +215,19 @@ class Solver:
         return self._of_tolerances[k]
 
     def _weight(self, k: int) -> Array:
-        """(channels,) that errors of a run are multiplied by: its rows go together."""
-        period = float(np.median(np.diff(self.predictions.protocol.runs[k].run.t)))
-        out: Array = np.sqrt(1 / max(1.0, INDEPENDENT_S / period)) / self.predictions.sigma
+        """(rows, channels) or (channels,) that errors of a run are multiplied by: its rows go together, and some are little to be trusted."""
+        out: Array = np.sqrt(self._share(k)) / np.sqrt(np.square(self.predictions.sigma) + self._scatter.get(k, 0.0))
         return out
 
     def _count(self, k: int) -> Array:
         """(channels,) how many independent errors the rows of a run are, as weighted."""
-        weight = np.square(self._weight(k) * self.predictions.sigma)
-        count: Array = (np.isfinite(self.predictions.measured[k]) & self.predictions.there[k][:, None]).sum(
-            axis=0
-        ) * weight
-        return count
+        count: Array = (np.isfinite(self.predictions.measured[k]) & self.predictions.there[k][:, None]).sum(axis=0)
+        return count * self._share(k)
+
+    def _share(self, k: int) -> float:
+        """Of how many independent errors a row is."""
+        period = float(np.median(np.diff(self.predictions.protocol.runs[k].run.t)))
+        return 1 / max(1.0, INDEPENDENT_S / period)
 
 
 #: of a process that shares the work

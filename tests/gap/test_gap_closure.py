@@ -218,14 +218,14 @@ def test_what_leaves_nothing_at_all_and_a_fold_without_rows_say_nothing() -> Non
     none = Closure(
         before=0, after=0, floor=0, closed=1, low=1, high=1, likelihood=0.0, within=0.0, joints=1, squares=np.zeros((2, 1)),
             apart=np.zeros((2, 1)),
-        counts=np.array([[0.0], [50.0]]), known=np.full(1, 4e-8), refit=Refit((), (), np.zeros(0)), std=(),
+        counts=np.array([[0.0], [50.0]]), refit=Refit((), (), np.zeros(0)), std=(),
         irregular=Irregular(*np.zeros((6, 2))),
     )  # fmt: skip
-    some = dataclasses.replace(none, squares=np.array([[0.0], [0.5]]))
+    some = dataclasses.replace(none, squares=np.array([[0.0], [0.5]]) / 4e-8)
     assert none.support(none) == none.foretold == none.uneven == 0.0
     # Of three joints one is left at ten times its sensor's error on the fold that has rows; what sensors of the body keep is none of a joint.
-    kept, rows = 4e-8 * np.array([[0.0] * 4, [1.0, 99.0, 1.0, 1e4]]), np.array([[0.0], [50.0]]).repeat(4, axis=1)
-    one = dataclasses.replace(none, joints=3, squares=kept * rows, counts=rows, known=np.full(4, 4e-8))
+    kept, rows = np.array([[0.0] * 4, [1.0, 99.0, 1.0, 1e4]]), np.array([[0.0], [50.0]]).repeat(4, axis=1)
+    one = dataclasses.replace(none, joints=3, squares=kept * rows, counts=rows)
     assert one.uneven == pytest.approx(math.log(10 / math.sqrt(2)))
     assert 0 < none.support(some) == -some.support(none) < 10
 
