@@ -5,7 +5,8 @@ and by how much it is behind from then on its stiffness, damping and inertia say
 rows before it (an autoregression, whose innovations have no memory: Kay, Fundamentals of Statistical Signal Processing II, 1998), and
 each command's answer is sought in what is new. Lost ones are taken out one after another while each is likelier than its price
 (matching pursuit), and the same is asked of commands that had come twice as far, which no fault does: what a model does wrong looks
-as much like these. Commands that scatter in time add a variance along all answers together, whose likelihood is exact.
+as much like these. Commands that scatter in time add a variance along all answers together, whose likelihood is exact; what a model does
+wrong looks like a lateness, too, but like one that comes and goes with the motion, and that is taken out first (marginalised).
 
 Nothing of it is fitted to what is judged: prices are the same for every recording.
 """
@@ -44,6 +45,10 @@ BURSTS = (1, 2, 3, 5, 8, 12)
 PRICE = float(np.log(12) + np.log(len(BURSTS)))
 #: variances of when commands act, s², for one of what else is new, a deviation of which is 1
 RATIOS = np.concatenate([[0.0], np.geomspace(0.0002, 0.08, 24) ** 2])
+#: s for which what a model does wrong lasts, as a motion does; variances of such a lateness, as `RATIOS`; a share of it that is none
+LASTS_S = 0.1
+LASTING = np.concatenate([[0.0], np.geomspace(0.0005, 0.08, 8) ** 2])
+NEGLIGIBLE = 1e-6
 #: s by which a command is taken to be late where the direction of that is found
 LATE_S = 0.004
 #: rad/s between which a servo's natural frequency is believed
@@ -145,7 +150,7 @@ def irregular(
     """
     joints = len(runs[0].plant.joints)
     sums, largest = np.zeros((3, joints + 1)), np.zeros((2, joints + 1))
-    volume, left, rows = np.zeros(len(RATIOS)), np.zeros(len(RATIOS)), 0
+    volume, left, rows = np.zeros((len(LASTING), len(RATIOS))), np.zeros((len(LASTING), len(RATIOS))), 0
     usual = {
         setup: _usual([error for one, error in zip(runs, errors, strict=True) if one.plant.setup is setup])
         for setup in Setup
@@ -170,10 +175,12 @@ def irregular(
             volume, left, rows = volume + more, left + rest, rows + count
     # What else is new is as large as it is without what commands do.
     size = np.maximum(left, TINY) / max(rows, 1)
-    scattered = -0.5 * (rows * np.log(size / size[0]) + volume) if rows else volume
+    likelihood = -0.5 * (rows * np.log(size / size[0, 0]) + volume)
+    best, which = likelihood.argmax(axis=0), np.arange(len(RATIOS))
+    scatter_s = np.sqrt(RATIOS * size[best, which])
     # A foot that slips once may look like a lost command in all joints, but not again and again.
     (lost, losses, told), (most, longest) = sums, largest
-    return Irregular(lost - most, losses, told, longest, scattered, np.sqrt(RATIOS * size))
+    return Irregular(lost - most, losses, told, longest, likelihood[best, which], scatter_s)
 
 
 def _usual(errors: Sequence[Array]) -> list[tuple[Array, float] | None]:
@@ -278,14 +285,29 @@ def _pursued(spans: Ints, seen: Array, half: Array, new: Array) -> tuple[list[fl
 
 
 def _scattered(group: Sequence[_Answers]) -> tuple[Array, Array, int]:
-    """Of commands that scatter, one packet for all joints: (RATIOS,) logarithm of the volume that they add, and squares left; rows."""
+    """Of commands that scatter, one packet for all joints: (LASTING, RATIOS) logarithm of the volume that they add, and squares left; rows.
+
+    Beside a lateness that comes and goes with the motion, as what a model does wrong looks.
+    """
     normal = np.sum([some.to_delay.T @ some.to_delay for some in group], axis=0)
-    shows, ways = np.linalg.eigh(normal)
-    along = np.square(ways.T @ np.sum([some.to_delay.T @ some.new for some in group], axis=0))
-    grows = 1 + RATIOS[:, None] * np.maximum(shows, 0.0)
-    whole = sum(float(some.new @ some.new) for some in group)
-    left = whole - (RATIOS[:, None] / grows * along).sum(axis=1)
-    return np.log(grows).sum(axis=1), left, sum(len(some.new) for some in group)
+    cross = np.sum([some.to_delay.T @ some.new for some in group], axis=0)
+    new = np.concatenate([some.new for some in group])
+    apart = np.subtract.outer(group[0].times, group[0].times) / LASTS_S
+    spread, modes = np.linalg.eigh(np.exp(-0.5 * np.square(apart)))
+    slow = modes[:, spread > NEGLIGIBLE] * np.sqrt(spread[spread > NEGLIGIBLE])
+    shows, turn = np.linalg.eigh(slow.T @ normal @ slow)
+    slow = slow @ turn
+    seen, along = normal @ slow, slow.T @ cross
+    volume, left = np.zeros((len(LASTING), len(RATIOS))), np.zeros((len(LASTING), len(RATIOS)))
+    for n, ratio in enumerate(LASTING):
+        # By Woodbury, what is seen of each command beside that lateness.
+        taken = ratio / (1 + ratio * np.maximum(shows, 0.0))
+        eigen, ways = np.linalg.eigh(normal - (seen * taken) @ seen.T)
+        grows = 1 + RATIOS[:, None] * np.maximum(eigen, 0.0)
+        more = RATIOS[:, None] / grows * np.square(ways.T @ (cross - seen @ (taken * along)))
+        volume[n] = np.log1p(ratio * np.maximum(shows, 0.0)).sum() + np.log(grows).sum(axis=1)
+        left[n] = new @ new - taken @ np.square(along) - more.sum(axis=1)
+    return volume, left, len(new)
 
 
 def _natural_modes(run: Run, plant: Plant) -> tuple[Array, Array]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -28,8 +30,12 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Plant:
 
 @pytest.fixture(scope="module")
 def run(plant: Plant) -> Run:
+    return motion(plant, PERIOD_S, ROWS)
+
+
+def motion(plant: Plant, period_s: float, rows: int) -> Run:
     """Eight joints that follow motions of their own about where the model rests."""
-    rng, t = np.random.default_rng(4), PERIOD_S * np.arange(ROWS, dtype=np.float64)
+    rng, t = np.random.default_rng(4), period_s * np.arange(rows, dtype=np.float64)
     ramp = np.clip(t / 0.5, 0, 1)
     columns = {}
     for j, joint in enumerate(JOINTS):
@@ -95,6 +101,19 @@ def test_what_a_model_does_wrong_is_no_lost_command(run: Run, plant: Plant) -> N
     assert found.nats(LOST) < 10
     assert found.nats(SCATTERED) < 10
     assert left(run, plant, late(0.001)).nats(SCATTERED) < 3
+
+
+def test_a_lateness_that_comes_and_goes_with_the_motion_is_none_of_each_command(plant: Plant) -> None:
+    """What a model does wrong looks so, and at 200 commands a second it changes little from one to the next."""
+    run, still = motion(plant, 0.005, 600), np.zeros(len(JOINTS))
+    acted = run.t - 0.004 * np.sin(2 * np.pi * 0.7 * run.t)
+    commands = {f"cmd.{joint}": np.interp(acted, run.t, run.column(f"cmd.{joint}")) for joint in JOINTS}
+    late_now_and_then = dataclasses.replace(run, columns={**run.columns, **commands})
+    pos = [Rollouts(plant, [one])([plant.model]).pos[0] for one in (late_now_and_then, run)]
+    errors = pos[0] - pos[1] + 1e-4 * np.random.default_rng(1).standard_normal(pos[0].shape)
+    found = irregular([Played.of(run, plant, still)], [errors], [plant], [still])
+    assert found.nats(SCATTERED) < 3
+    assert found.nats(LOST) < 10
 
 
 def test_a_few_rows_say_nothing_of_commands(run: Run, plant: Plant) -> None:
