@@ -27,6 +27,7 @@ import re
 import time
 from collections import deque
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -312,7 +313,7 @@ class BodyTracker:
         if self._elsewhere:
             return BodyLost(t, "the origin tag or the camera has moved")
         if self._origin is None:
-            return BodyLost(t, f"origin tag {setup.origin_id} not seen yet" + self._other_reading(gray))
+            return BodyLost(t, self._why_not(sightings, "origin") + self._other_reading(gray))
         if self._scaled:
             return BodyLost(t, self._scaled)
         body = None if seen is None else (*seen.corners.mean(axis=0).tolist(), seen.size_px)
@@ -326,7 +327,7 @@ class BodyTracker:
         if self._view_moved:
             return BodyLost(t, f"the view has moved while origin tag {setup.origin_id} was hidden: uncover it")
         if seen is None:
-            return BodyLost(t, self._why_not(sightings) + self._other_reading(gray))
+            return BodyLost(t, self._why_not(sightings, "body") + self._other_reading(gray))
         return self._steady(self._pose(seen, lens, t, tilt, began))
 
     def _sightings(self, gray: Gray, t: float) -> list[Sighting]:
@@ -368,18 +369,21 @@ class BodyTracker:
                 return BodyLost(found.t, self._jump_words)
         return found
 
-    def _why_not(self, sightings: list[Sighting]) -> str:
-        tag = self.setup.body_id
-        doubtful = [s for s in sightings if s.id == tag]
-        if doubtful:
+    def _why_not(self, sightings: list[Sighting], which: Literal["origin", "body"]) -> str:
+        """Why one of the two tags has no place in a picture."""
+        ids = {"origin": self.setup.origin_id, "body": self.setup.body_id}
+        named = f"{which} tag {ids[which]}"
+        doubtful = [s for s in sightings if s.id == ids[which]]
+        # An origin that is read well is asked for in some more pictures, and one picture is soon read amiss.
+        if doubtful and best(sightings, ids[which], self.setup) is None and self._unread > 1:
             s = max(doubtful, key=lambda s: s.margin)
             if s.hamming and s.margin >= self.setup.min_margin:
-                return f"body tag {tag} is doubtful (wrong bits: {s.hamming}): a spot, a crease or a shadow on it"
+                return f"{named} is doubtful (wrong bits: {s.hamming}): a spot, a crease or a shadow on it"
             how = f"margin {number(s.margin, decimals=1)}, wrong bits: {s.hamming}"
-            return f"body tag {tag} is doubtful ({how}): too small, too dark or blurred"
-        others = sorted({s.id for s in sightings if s.margin >= self.setup.min_margin and s.hamming == 0})
-        others = [i for i in others if i != self.setup.origin_id]
-        return f"body tag {tag} not seen" + (f" (but tag {', '.join(map(str, others))})" if others else "")
+            return f"{named} is doubtful ({how}): too small, too dark or blurred"
+        sure = {s.id for s in sightings if s.margin >= self.setup.min_margin and s.hamming == 0}
+        others = ", ".join(map(str, sorted(sure - set(ids.values()))))
+        return f"{named} not seen{' yet' if which == 'origin' else ''}" + (f" (but tag {others})" if others else "")
 
     @property
     def corner_noise_px(self) -> float:

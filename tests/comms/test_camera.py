@@ -128,6 +128,23 @@ def test_a_tag_with_a_wrong_bit_is_neither_followed_nor_taken_for_another(monkey
             assert all(isinstance(one, BodyLost) for one in others)
 
 
+def test_an_origin_tag_with_a_wrong_bit_is_said_to_have_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    printed = TagFamily.bitmap
+
+    def bitmap(kind: TagFamily, tag: int) -> np.ndarray:
+        cells, corner = printed(kind, tag), (kind.cells - kind.edge_cells) // 2
+        if tag == 0:
+            x, y = kind.bits[3]
+            cells[corner + y, corner + x] ^= 255
+        return cells
+
+    monkeypatch.setattr(TagFamily, "bitmap", bitmap)
+    camera = OverheadCamera(SMALL, seed=3)
+    tracker = BodyTracker(TagSetup(), camera.intrinsics)
+    lost = [tracker.track(photo(camera, scene(x=0.6)), t) for t in (0.0, 0.1)][-1]
+    assert lost == BodyLost(0.1, "origin tag 0 is doubtful (wrong bits: 1): a spot, a crease or a shadow on it")
+
+
 @pytest.mark.parametrize("family", ["tagCircle21h7", "tag36h11", "tag16h5", "tag25h9"])
 def test_each_family_is_found_at_five_distances_and_tilts_within_its_stated_error(family: str) -> None:
     """The camera hangs at 2.6 m, as over a real arena; the body tag comes nearer and tilts more."""
