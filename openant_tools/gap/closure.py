@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.effects.effect import Effect
 from openant_tools.gap.fitting import Fits
 from openant_tools.gap.hypothesis import Refit
 from openant_tools.gap.innovations import Irregular, irregular
@@ -64,6 +65,14 @@ class Closure:
     def foretold(self) -> float:
         """What support would be if it were right: what it leaves is none of what it says that the other leaves beside that."""
         return self._less(self.squares + self.apart)
+
+    def explained(self, effect: Effect) -> float:
+        """What support a cause of random times would have: of errors of joints it leaves what its commands do not account for."""
+        share = np.zeros(self.squares.shape[1])
+        share[: self.joints] = self.irregular.explained(effect)
+        rows = np.maximum(self.counts, 1.0)
+        each = np.log((self.squares / rows + 1) / ((1 - share) * self.squares / rows + 1))
+        return float(0.5 * each.sum()) / len(rows)
 
     @property
     def uneven(self) -> float:

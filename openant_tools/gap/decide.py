@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 
@@ -21,7 +21,7 @@ import numpy as np
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED
 
 __all__ = [
-    "OUTSIDE", "PRESENT", "WEIGHTS", "Anomaly", "Decision", "Row", "chances", "decide", "presence", "present", "weights",
+    "OUTSIDE", "PRESENT", "WEIGHTS", "Anomaly", "Decision", "Row", "chances", "decide", "led", "presence", "present", "weights",
     "worth_fitting",
 ]  # fmt: skip
 
@@ -78,7 +78,8 @@ class Row:
         likelier: nats by which what it was fitted to is, its sizes and tolerances with it, than what it is compared with makes it.
             within: the same, with no more of its cause than robots of one build differ by.
         gain: share of the excess gap that it closes on held-out folds beyond what is closed without it, for the report.
-        irregular: of a cause that acts at random times nats by which innovations are likelier than without it.
+        irregular: of a cause that acts at random times nats by which innovations are likelier than without it. explained: what its
+            support would be if it did what they say of it.
     """
 
     causes: tuple[str, ...]
@@ -94,6 +95,7 @@ class Row:
     within: float = 0.0
     gain: float | None = None
     irregular: float = 0.0
+    explained: float = 0.0
 
     def held_out(self, weights: Mapping[str, float]) -> float:
         """What held-out data say of it, in nats."""
@@ -157,6 +159,12 @@ def _fitted(rows: Sequence[Row], uneven: float, weights: Mapping[str, float]) ->
         elif row.irregular:
             out[row.causes] = weights["irregular"] * _sure(row.irregular)
     return out
+
+
+def led(rows: Sequence[Row]) -> list[Row]:
+    """The same rows, of which no cause of random times leads that accounts for less of the gap than another: it may be there beside that."""
+    most = max((row.support for row in rows if row.leads and row.support is not None), default=0.0)
+    return [replace(row, leads=row.leads and not (row.irregular and row.explained < most)) for row in rows]
 
 
 def chances(rows: Sequence[Row], anomaly: Anomaly, weights: Mapping[str, float]) -> dict[str, float]:

@@ -23,7 +23,7 @@ from openant_tools.errors import BadInput
 from openant_tools.files import json_text, write_text
 from openant_tools.gap.assess import Assessment, assess
 from openant_tools.gap.cache import cache_folder, code, keep_small
-from openant_tools.gap.decide import PRESENT, Row, decide, present, weights, worth_fitting
+from openant_tools.gap.decide import PRESENT, Row, decide, led, present, weights, worth_fitting
 from openant_tools.gap.diagnosis import UNEXPLAINED, Diagnosis, read_diagnosis
 from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.finding import Given, Tried, finding
@@ -142,7 +142,7 @@ def hypotheses(experiment: Experiment, prior: Sequence[str], progress: Progress)
         replace(trials.row((name,)), leads=name in leading, told=catalogue()[name].told, expected=word.get(name, 0.0))
         for name in sorted(fit, key=lambda name: (-fit[name], name))
     ]
-    return trials, [trials.none(), *rows]
+    return trials, [trials.none(), *led(rows)]
 
 
 @_alike_everywhere()

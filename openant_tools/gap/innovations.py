@@ -70,6 +70,8 @@ class Irregular:
             stretch that says most.
         losses: (joints + 1,) commands that were found lost. told: of how many it could be told. longest_s: (joints + 1,) s in a row.
         scattered: (RATIOS,) nats by which commands that act at times that scatter are likelier than punctual ones. scatter_s: by how much.
+        squares: (joints,) rad², of errors summed over rows. gone: (joints + 1, joints) those that lost commands of each joint, and of
+            all joints at once, account for. moved: (joints,) rad²/s², those that commands a second off make, each by itself.
     """
 
     lost: Array
@@ -78,6 +80,19 @@ class Irregular:
     longest_s: Array
     scattered: Array
     scatter_s: Array
+    squares: Array
+    gone: Array
+    moved: Array
+
+    def explained(self, effect: Effect) -> Array:
+        """(joints,) share of squared errors that it accounts for."""
+        if effect.random is Chance.LOST:
+            squares = self.gone[int(self.lost.argmax())]
+        else:
+            (std_s,), _ = self.sizes(effect)
+            squares = std_s**2 * self.moved
+        share: Array = np.clip(squares / np.maximum(self.squares, TINY), 0.0, 1.0)
+        return share
 
     def nats(self, effect: Effect) -> float:
         """By how much it is likelier than on a healthy robot."""
@@ -114,6 +129,7 @@ class _Answers:
         new: (rows,) innovations, in deviations. to_offset, to_delay: (rows, commands), as these see a setpoint that is a radian off
             while a command is in force, and a command that comes a second after its time.
         times, values: (commands,) s, when they were sent, and rad.
+        error: (rows,) rad. offset, delayed: (rows, commands) as to_offset and to_delay, as errors show it.
     """
 
     new: Array
@@ -121,6 +137,9 @@ class _Answers:
     to_delay: Array
     times: Array
     values: Array
+    error: Array
+    offset: Array
+    delayed: Array
 
     @cached_property
     def spans(self) -> Ints:
@@ -132,9 +151,16 @@ class _Answers:
     @cached_property
     def lost(self) -> Array:
         """(rows, stretches) what innovations see where these were lost, and the command before them stays in force."""
-        first, stop = self.spans.T
-        up_to = np.pad(np.cumsum(self.to_offset, axis=1), ((0, 0), (1, 0)))
-        at = np.pad(np.cumsum(self.to_offset * self.values, axis=1), ((0, 0), (1, 0)))
+        return self._without(self.to_offset, self.spans)
+
+    def without(self, spans: Ints) -> Array:
+        """(rows, stretches) the same, as errors show it."""
+        return self._without(self.offset, spans)
+
+    def _without(self, to_offset: Array, spans: Ints) -> Array:
+        first, stop = spans.T
+        up_to = np.pad(np.cumsum(to_offset, axis=1), ((0, 0), (1, 0)))
+        at = np.pad(np.cumsum(to_offset * self.values, axis=1), ((0, 0), (1, 0)))
         out: Array = self.values[first - 1] * (up_to[:, stop] - up_to[:, first]) - (at[:, stop] - at[:, first])
         return out
 
@@ -150,6 +176,7 @@ def irregular(
     """
     joints = len(runs[0].plant.joints)
     sums, largest = np.zeros((3, joints + 1)), np.zeros((2, joints + 1))
+    squares, gone, moved = np.zeros(joints), np.zeros((joints + 1, joints)), np.zeros(joints)
     volume, left, rows = np.zeros((len(LASTING), len(RATIOS))), np.zeros((len(LASTING), len(RATIOS))), 0
     usual = {
         setup: _usual([error for one, error in zip(runs, errors, strict=True) if one.plant.setup is setup])
@@ -166,11 +193,15 @@ def irregular(
             if not known:
                 continue
             together = len({some.times.tobytes() for some in known}) == 1
-            groups = [[] if some is None else [some] for some in answers]
-            for n, group in enumerate([*groups, known if together else []]):
+            there = [j for j, some in enumerate(answers) if some is not None]
+            squares[there] += [some.error @ some.error for some in known]
+            moved[there] += [np.square(some.delayed).sum() for some in known]
+            for n, group in enumerate([*([j] for j in there), there if together else []]):
                 if group:
-                    said, most = _searched(group)
-                    sums[:, n], largest[:, n] = sums[:, n] + said, np.maximum(largest[:, n], most)
+                    at = group[0] if n < len(there) else joints
+                    said, most, less = _searched([some for j, some in zip(there, known, strict=True) if j in group])
+                    sums[:, at], largest[:, at] = sums[:, at] + said, np.maximum(largest[:, at], most)
+                    gone[at, group] += less
             more, rest, count = _scattered(known if together else known[:1])
             volume, left, rows = volume + more, left + rest, rows + count
     # What else is new is as large as it is without what commands do.
@@ -180,7 +211,7 @@ def irregular(
     scatter_s = np.sqrt(RATIOS * size[best, which])
     # A foot that slips once may look like a lost command in all joints, but not again and again.
     (lost, losses, told), (most, longest) = sums, largest
-    return Irregular(lost - most, losses, told, longest, likelihood[best, which], scatter_s)
+    return Irregular(lost - most, losses, told, longest, likelihood[best, which], scatter_s, squares, gone, moved)
 
 
 def _usual(errors: Sequence[Array]) -> list[tuple[Array, float] | None]:
@@ -243,12 +274,13 @@ def _answers(
     seen = [
         np.einsum("kcl,l->kc", sliding_window_view(x, ORDER + 1, axis=0)[known], ahead) for x in (to_offset, to_delay)
     ]
-    return _Answers(new, seen[0], seen[1], times, values)
+    now = rows[ORDER:][known]
+    return _Answers(new, seen[0], seen[1], times, values, error[now], to_offset[ORDER:][known], to_delay[ORDER:][known])
 
 
-def _searched(group: Sequence[_Answers]) -> tuple[Array, Array]:
+def _searched(group: Sequence[_Answers]) -> tuple[Array, Array, Array]:
     """Of joints whose commands are lost at once: nats, of how many that were found, of how many it could be told; nats of the stretch
-    that says most, and s of the longest."""
+    that says most, and s of the longest; of each joint rad² of errors that they account for."""
     one, new, seen = (
         group[0],
         np.concatenate([some.new for some in group]),
@@ -264,7 +296,15 @@ def _searched(group: Sequence[_Answers]) -> tuple[Array, Array]:
     # The first stretches are of one command each.
     tells = half[: len(gone) - 1] > TELLS
     nats = sum(gains) - sum(mirrored)
-    return np.array([nats, (tells & gone[1:]).sum(), tells.sum()]), np.array([max(gains, default=0.0), longest])
+    less = np.zeros(len(group))
+    if found:
+        shown = [some.without(np.array(found)).sum(axis=1) for some in group]
+        less = np.array([(2 * some.error - shows) @ shows for some, shows in zip(group, shown, strict=True)])
+    return (
+        np.array([nats, (tells & gone[1:]).sum(), tells.sum()]),
+        np.array([max(gains, default=0.0), longest]),
+        less,
+    )
 
 
 def _pursued(spans: Ints, seen: Array, half: Array, new: Array) -> tuple[list[float], list[Ints]]:

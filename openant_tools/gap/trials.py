@@ -79,8 +79,11 @@ class Trials:
         places = tuple(where.get(name) or self.assessment.place(name) for name in causes)
         fit = self.along[causes] if len(causes) > 1 else self.assessment.fit[causes[0]]
         if catalogue()[causes[-1]].random:
-            at = self.closures[_simulated(causes)].irregular.joints(catalogue()[causes[-1]])
-            return Row(causes, (*places[:-1], at), fit, irregular=self._irregular(causes))
+            effect, base = catalogue()[causes[-1]], self.closures[_simulated(causes)]
+            at = base.irregular.joints(effect)
+            return Row(
+                causes, (*places[:-1], at), fit, irregular=self._irregular(causes), explained=base.explained(effect)
+            )
         one, other = self.closures.get(causes), self.closures.get(causes[:-1])
         if one is None or other is None or not self.tells(causes[-1]):
             return Row(causes, places, fit)

@@ -19,6 +19,7 @@ from openant_tools.gap.decide import (
     Row,
     chances,
     decide,
+    led,
     presence,
     present,
     weights,
@@ -110,6 +111,17 @@ def test_lost_commands_that_are_seen_one_by_one_lead_whatever_else_fits() -> Non
     beside = Row(("actuator_lag", "command_dropout"), ((0,), (0, 1)), 3.0, irregular=250.0)
     assert present([beside], 0.0, weights())["command_dropout"] > PRESENT
     assert present([replace(beside, irregular=0.0)], 0.0, weights()) == {}
+
+
+def test_scattered_commands_that_account_for_little_of_a_gap_do_not_lead_it() -> None:
+    rubs = replace(LAG, fit=255.0, support=0.54, likelier=87.0, within=9.0)
+    scattered = Row(("clock_jitter",), ((0,),), 44.0, irregular=30.0, explained=0.09)
+    rows = [NOTHING, rubs, scattered]
+    assert decide(led(rows), Anomaly(18.0, 7.0)).verdict == "actuator_lag"
+    assert led(rows)[1] == rubs
+    accounts = [NOTHING, rubs, replace(scattered, irregular=300.0, explained=0.6)]
+    assert led(accounts) == accounts
+    assert led([NOTHING, replace(rubs, leads=False), scattered])[2].leads, "one that may not lead itself displaces none"
 
 
 def test_of_two_that_cannot_be_told_apart_the_motions_own_goes_into_the_model() -> None:

@@ -22,7 +22,7 @@ from openant_tools.effects.robot import Robot
 from openant_tools.gap.closure import Closure, calibration_of, closures, heat_loss_of
 from openant_tools.gap.fitting import Fits
 from openant_tools.gap.hypothesis import Part, Refit
-from openant_tools.gap.innovations import Irregular
+from openant_tools.gap.innovations import RATIOS, Irregular
 from openant_tools.gap.prediction import Predictions
 from openant_tools.gap.protocol import Played, RunSet, rollouts_of
 from openant_tools.gap.simulation import Log, simulate
@@ -219,7 +219,7 @@ def test_what_leaves_nothing_at_all_and_a_fold_without_rows_say_nothing() -> Non
         before=0, after=0, floor=0, closed=1, low=1, high=1, likelihood=0.0, within=0.0, joints=1, squares=np.zeros((2, 1)),
             apart=np.zeros((2, 1)),
         counts=np.array([[0.0], [50.0]]), refit=Refit((), (), np.zeros(0)), std=(),
-        irregular=Irregular(*np.zeros((6, 2))),
+        irregular=Irregular(*np.zeros((6, 2)), squares=np.zeros(1), gone=np.zeros((2, 1)), moved=np.zeros(1)),
     )  # fmt: skip
     some = dataclasses.replace(none, squares=np.array([[0.0], [0.5]]) / 4e-8)
     assert none.support(none) == none.foretold == none.uneven == 0.0
@@ -228,6 +228,16 @@ def test_what_leaves_nothing_at_all_and_a_fold_without_rows_say_nothing() -> Non
     one = dataclasses.replace(none, joints=3, squares=kept * rows, counts=rows)
     assert one.uneven == pytest.approx(math.log(10 / math.sqrt(2)))
     assert 0 < none.support(some) == -some.support(none) < 10
+    # Commands that scatter account for three quarters of the squares: it keeps half of the rest.
+    punctual = np.full(len(RATIOS), -9.0)
+    punctual[-1] = 0.0
+    scattered = dataclasses.replace(none.irregular, scattered=punctual, scatter_s=np.sqrt(RATIOS))
+    scattered = dataclasses.replace(
+        scattered, moved=np.array([0.75 / scattered.sizes(catalogue()["clock_jitter"])[0][0] ** 2]), squares=np.ones(1)
+    )
+    noisy = dataclasses.replace(none, squares=np.full((2, 1), 1e6), counts=np.ones((2, 1)), irregular=scattered)
+    assert noisy.explained(catalogue()["clock_jitter"]) == pytest.approx(math.log(2), abs=1e-3)
+    assert none.explained(catalogue()["clock_jitter"]) == 0.0
 
 
 #: a box on a floor, and a weight on an arm on it that shakes it

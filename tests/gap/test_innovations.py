@@ -72,6 +72,7 @@ def test_commands_that_are_lost_are_found_one_by_one(run: Run, plant: Plant) -> 
     found = left(run, plant, losing(0.1))
     assert found.nats(LOST) > max(100, found.nats(SCATTERED))
     assert found.joints(LOST) == tuple(range(len(JOINTS)))
+    assert np.median(found.explained(LOST)) > 0.4 > 2 * np.median(found.explained(SCATTERED))
     share, longest_s = found.sizes(LOST)[0]
     assert share == pytest.approx(0.1, abs=0.04)
     assert longest_s == pytest.approx(0.04, abs=0.025)
@@ -91,6 +92,7 @@ def test_commands_that_scatter_are_not_lost(run: Run, plant: Plant, std_s: float
     assert found.nats(SCATTERED) > max(100, 3 * found.nats(LOST))
     (size,), (deviation,) = found.sizes(SCATTERED)
     assert abs(size - std_s) < 2 * deviation < 0.8 * std_s
+    assert np.median(found.explained(SCATTERED)) > 0.5
 
 
 def test_what_a_model_does_wrong_is_no_lost_command(run: Run, plant: Plant) -> None:
@@ -100,6 +102,7 @@ def test_what_a_model_does_wrong_is_no_lost_command(run: Run, plant: Plant) -> N
     found = left(run, plant, robot)
     assert found.nats(LOST) < 10
     assert found.nats(SCATTERED) < 10
+    assert max(found.explained(LOST).max(), found.explained(SCATTERED).max()) < 0.1
     assert left(run, plant, late(0.001)).nats(SCATTERED) < 3
 
 
