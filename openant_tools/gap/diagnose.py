@@ -91,7 +91,7 @@ def diagnose(
             place.touch()  # used now
             return found
     trials, rows = hypotheses(experiment, prior, lambda share, words: tell(0.02 + 0.73 * share, words))
-    decision = decide(rows, trials.assessment.evidence.anomaly)
+    decision = decide(rows, trials.anomaly)
     # Others are looked for also beside a cause than which something unknown is likelier so far, or another cause as likely.
     chosen = (decision.likeliest,) if decision.verdict == UNEXPLAINED else decision.causes
     declined, there = list[Row](), dict[str, float]()
@@ -111,7 +111,7 @@ def diagnose(
         chosen = more.causes
         rows.append(more)
     # What several causes explain together is not unexplained, and those that are both there are no alternatives.
-    decision = decide(rows, trials.assessment.evidence.anomaly)
+    decision = decide(rows, trials.anomaly)
     if not set(decision.causes) & set(chosen):
         chosen = decision.causes
     tell(1.0, "decision")

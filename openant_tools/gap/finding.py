@@ -118,7 +118,7 @@ def finding(trials: Trials, given: Given, tried: Tried, decision: Decision, chos
         sensors=_sensors(trials, given, there),
         rows=tuple(map(_row, tried.rows)),
         declined=tuple(map(_row, tried.declined)),
-        anomaly=asdict(trials.assessment.evidence.anomaly),
+        anomaly=asdict(trials.anomaly),
     )
 
 

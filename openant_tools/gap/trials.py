@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.gap.assess import Assessment
 from openant_tools.gap.closure import Closure, closures
-from openant_tools.gap.decide import Row
+from openant_tools.gap.decide import Anomaly, Row
 from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.fitting import Fits
 from openant_tools.gap.hypothesis import Part, Refit, sized
@@ -72,6 +73,14 @@ class Trials:
                 self.starts[causes] = refit
                 found[causes[-1]] = likelihood - known.likelihood
         return found
+
+    @property
+    def anomaly(self) -> Anomaly:
+        """How far the recording is from the model, and without what its best cause explains: a template, or commands one by one."""
+        known, base = self.assessment.evidence.anomaly, self.closures[()]
+        random = [effect for name, effect in catalogue().items() if effect.random and name in self.assessment.fit]
+        explained = max((base.explained(one) for one in random if base.irregular.nats(one) > 0), default=0.0)
+        return replace(known, left=min(known.left, known.size * math.exp(-explained / base.joints)))
 
     def row(self, causes: Causes) -> Row:
         """What is known of the last of some causes, beside the others."""

@@ -6,6 +6,7 @@ import dataclasses
 import math
 import os
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import joblib
@@ -20,12 +21,14 @@ import openant_tools.gap.prediction as prediction
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.closure import Closure, calibration_of, closures, heat_loss_of
+from openant_tools.gap.decide import Anomaly
 from openant_tools.gap.fitting import Fits
 from openant_tools.gap.hypothesis import Part, Refit
 from openant_tools.gap.innovations import RATIOS, Irregular
 from openant_tools.gap.prediction import Predictions
 from openant_tools.gap.protocol import Played, RunSet, rollouts_of
 from openant_tools.gap.simulation import Log, simulate
+from openant_tools.gap.trials import Trials
 from openant_tools.model.plant import load_plant
 from openant_tools.model.rollout import Rollouts
 
@@ -228,16 +231,33 @@ def test_what_leaves_nothing_at_all_and_a_fold_without_rows_say_nothing() -> Non
     one = dataclasses.replace(none, joints=3, squares=kept * rows, counts=rows)
     assert one.uneven == pytest.approx(math.log(10 / math.sqrt(2)))
     assert 0 < none.support(some) == -some.support(none) < 10
-    # Commands that scatter account for three quarters of the squares: it keeps half of the rest.
-    punctual = np.full(len(RATIOS), -9.0)
-    punctual[-1] = 0.0
-    scattered = dataclasses.replace(none.irregular, scattered=punctual, scatter_s=np.sqrt(RATIOS))
-    scattered = dataclasses.replace(
-        scattered, moved=np.array([0.75 / scattered.sizes(catalogue()["clock_jitter"])[0][0] ** 2]), squares=np.ones(1)
-    )
-    noisy = dataclasses.replace(none, squares=np.full((2, 1), 1e6), counts=np.ones((2, 1)), irregular=scattered)
-    assert noisy.explained(catalogue()["clock_jitter"]) == pytest.approx(math.log(2), abs=1e-3)
-    assert none.explained(catalogue()["clock_jitter"]) == 0.0
+
+
+def test_commands_that_scatter_explain_the_squares_that_they_account_for() -> None:
+    """Three quarters of them: of the gap half is left, and nothing unknown need have made the rest of it."""
+    jitter, punctual = catalogue()["clock_jitter"], np.zeros(len(RATIOS))
+    punctual[-1] = 20.0
+    said = Irregular(
+        *np.zeros((4, 2)), scattered=punctual, scatter_s=np.sqrt(RATIOS), squares=np.ones(1), gone=np.zeros((2, 1)), moved=np.zeros(1)
+    )  # fmt: skip
+    (std_s,), _ = said.sizes(jitter)
+    none = Closure(
+        before=0, after=0, floor=0, closed=0, low=0, high=0, likelihood=0.0, within=0.0, joints=1, squares=np.full((2, 1), 1e6),
+        apart=np.zeros((2, 1)), counts=np.ones((2, 1)), refit=Refit((), (), np.zeros(0)), std=(), irregular=said,
+    )  # fmt: skip
+    some = dataclasses.replace(none, irregular=dataclasses.replace(said, moved=np.array([0.75 / std_s**2])))
+    assert none.explained(jitter) == 0.0
+    assert some.explained(jitter) == pytest.approx(math.log(2), abs=1e-3)
+
+    def left(closure: Closure) -> float:
+        known: Any = SimpleNamespace(fit={"clock_jitter": 1.0}, evidence=SimpleNamespace(anomaly=Anomaly(1.8, 1.7)))
+        anything: Any = None
+        return Trials(anything, known, anything, {(): closure}).anomaly.left
+
+    assert left(none) == 1.7
+    assert left(some) == pytest.approx(0.9, abs=1e-3)
+    unheard = dataclasses.replace(some.irregular, scattered=np.zeros(len(RATIOS)))
+    assert left(dataclasses.replace(some, irregular=unheard)) == 1.7
 
 
 #: a box on a floor, and a weight on an arm on it that shakes it
