@@ -24,6 +24,7 @@ from scipy.optimize import minimize
 from openant_tools.blind.answers import read_answers
 from openant_tools.files import json_text, read_toml, write_text
 from openant_tools.gap.decide import FILE, OUTSIDE, WEIGHTS, Anomaly, Row, chances, present
+from openant_tools.gap.decide import weights as shipped
 from openant_tools.gap.diagnosis import NONE
 from openant_tools.virtual.seal import read_key
 
@@ -210,6 +211,7 @@ def main() -> None:
         keep(options.keep / f"{folder.stem}.json", some)
     for n, folder in enumerate(options.sets):
         print(folder.name, "by the weights it begins with:", figures(sets[n], START))
+        print(folder.name, "by the shipped ones:", figures(sets[n], shipped()))
         if others := [some for k, some in enumerate(sets) if k != n]:
             print(folder.name, "by the others:", figures(sets[n], learned(others)))
             print(folder.name, "the same, templates alone:", figures(sets[n], learned(others, fitted=False)))

@@ -59,20 +59,18 @@ class Closure:
         Up to a factor that of their likelihoods, where errors of each channel on each fold have a size of their own that nobody knows,
         but not less than they are known to.
         """
-        return self._less(other.squares)
+        return self._less(other.squares, self.squares)
 
     @property
     def foretold(self) -> float:
         """What support would be if it were right: what it leaves is none of what it says that the other leaves beside that."""
-        return self._less(self.squares + self.apart)
+        return self._less(self.squares + self.apart, self.squares)
 
     def explained(self, effect: Effect) -> float:
         """What support a cause of random times would have: of errors of joints it leaves what its commands do not account for."""
-        share = np.zeros(self.squares.shape[1])
-        share[: self.joints] = self.irregular.explained(effect)
-        rows = np.maximum(self.counts, 1.0)
-        each = np.log((self.squares / rows + 1) / ((1 - share) * self.squares / rows + 1))
-        return float(0.5 * each.sum()) / len(rows)
+        left = np.ones(self.squares.shape[1])
+        left[: self.joints] -= self.irregular.explained(effect)
+        return self._less(self.squares, left * self.squares)
 
     @property
     def uneven(self) -> float:
@@ -87,9 +85,9 @@ class Closure:
         """nats by which what it was fitted to is likelier than by another."""
         return self.likelihood - other.likelihood
 
-    def _less(self, squares: Array) -> float:
+    def _less(self, before: Array, after: Array) -> float:
         rows = np.maximum(self.counts, 1.0)  # of a fold without any nothing is left
-        each = np.log((squares / rows + 1) / (self.squares / rows + 1))
+        each = np.log((before / rows + 1) / (after / rows + 1))
         return float(0.5 * each.sum()) / len(rows)
 
 

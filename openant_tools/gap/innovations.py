@@ -185,24 +185,26 @@ def irregular(
     for one, error, plant, delay in zip(runs, errors, plants, delays, strict=True):
         modes = _natural_modes(one.run, plant)
         for window in one.windows or [(float(one.run.t[0]), float(one.run.t[-1]) + 1.0)]:
-            answers = [
-                _answers(one, j, error[:, j], window, delay[j], modes[0][j], modes[1][j], usual[one.plant.setup][j])
+            answers = {
+                j: known
                 for j in range(joints)
-            ]
-            known = [some for some in answers if some is not None]
-            if not known:
+                if (known := _answers(
+                    one, j, error[:, j], window, delay[j], modes[0][j], modes[1][j], usual[one.plant.setup][j]
+                )) is not None
+            }  # fmt: skip
+            if not answers:
                 continue
-            together = len({some.times.tobytes() for some in known}) == 1
-            there = [j for j, some in enumerate(answers) if some is not None]
-            squares[there] += [some.error @ some.error for some in known]
-            moved[there] += [np.square(some.delayed).sum() for some in known]
-            for n, group in enumerate([*([j] for j in there), there if together else []]):
-                if group:
-                    at = group[0] if n < len(there) else joints
-                    said, most, less = _searched([some for j, some in zip(there, known, strict=True) if j in group])
-                    sums[:, at], largest[:, at] = sums[:, at] + said, np.maximum(largest[:, at], most)
-                    gone[at, group] += less
-            more, rest, count = _scattered(known if together else known[:1])
+            every = list(answers.values())
+            together = len({some.times.tobytes() for some in every}) == 1
+            for j, some in answers.items():
+                squares[j] += some.error @ some.error
+                moved[j] += np.square(some.delayed).sum()
+            groups = {j: [j] for j in answers} | ({joints: list(answers)} if together else {})
+            for at, group in groups.items():
+                said, most, less = _searched([answers[j] for j in group])
+                sums[:, at], largest[:, at] = sums[:, at] + said, np.maximum(largest[:, at], most)
+                gone[at, group] += less
+            more, rest, count = _scattered(every if together else every[:1])
             volume, left, rows = volume + more, left + rest, rows + count
     # What else is new is as large as it is without what commands do.
     size = np.maximum(left, TINY) / max(rows, 1)
